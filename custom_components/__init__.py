@@ -1,0 +1,1 @@
+"""Makes this folder a package: the test plugin has one of the same name."""
