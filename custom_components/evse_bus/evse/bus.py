@@ -1,0 +1,391 @@
+"""One line's scheduler: one task owns the line, one exchange at a time.
+
+Who speaks next is `schedule.choose`'s to say, an exchange `exchange.Wire`'s;
+this module has the turns: retries, presence, reopening of a lost port.
+"""
+
+import asyncio
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+import logging
+from math import inf
+from typing import Final
+
+from .charger import Charger
+from .exchange import Talk, Wire
+from .framing import Frame, Framer, Timing
+from .jobs import Job, JobQueue, Later, Step
+from .line import Line
+from .model import (
+    EvseError,
+    ExchangeRefusedError,
+    ImplausibleReplyError,
+    LineError,
+    LineLostError,
+    NotAvailableError,
+    OrderChange,
+    Persistence,
+    ReplyTimeoutError,
+)
+from .schedule import Kind, Slot, choose
+from .statistics import ChargerStatistics
+
+_LOGGER = logging.getLogger(__name__)
+
+REOPEN_FIRST: Final = 1.0
+"""First pause before a lost port is opened again, s; doubles."""
+REOPEN_LIMIT: Final = 30.0
+"""Longest such pause, s."""
+STOP_PATIENCE: Final = 6.0
+"""Longest time a stop waits for a conversation begun (waking a car: 3 s), s."""
+
+
+class Bus:
+    """All chargers of one line, and the line."""
+
+    def __init__(
+        self, line: Line, framer: Framer[Frame], timing: Timing, name: str = ""
+    ) -> None:
+        """Put chargers on with `add`, then `start`."""
+        self.line = line
+        self.name = name or line.url
+        self.wire = Wire(line, framer, timing)
+        self.wire.on_unasked = self._on_unasked
+        self.chargers: dict[str, Charger] = {}
+        self.connected = False
+        """The port is open."""
+        self._jobs = JobQueue()
+        self._task: asyncio.Task[None] | None = None
+        self._stopping = False
+        self._wake: asyncio.Future[None] | None = None
+        self._turn_of: Slot | None = None
+        self._turn_over = asyncio.Event()
+        self._last_probe = -inf
+        self._listeners: list[Callable[[], None]] = []
+        line.on_lost = self._on_lost
+
+    # -- Life --------------------------------------------------------------------
+
+    async def start(self) -> None:
+        """Open the port and start; raises LineError when it cannot be opened."""
+        await self.line.open()
+        self._stopping = False
+        self._on_open()
+        self._task = asyncio.create_task(self._run(), name=f"bus {self.name}")
+
+    async def stop(self) -> None:
+        """Finish what is being said, close the port, leave nothing behind."""
+        self._stopping = True
+        stopped = NotAvailableError(f"{self.name} is stopped")
+        self._jobs.fail_all(stopped, begun=False)
+        if self._task is not None:
+            self._look_again()
+            done, _ = await asyncio.wait({self._task}, timeout=STOP_PATIENCE)
+            if not done:
+                self._task.cancel()
+                with suppress(asyncio.CancelledError):
+                    await self._task
+            self._task = None
+        self._jobs.fail_all(stopped)
+        self.connected = False
+        await self.line.close()
+
+    def add(self, charger: Charger) -> None:
+        """Put a charger on the bus; the others do not notice."""
+        charger.bus = self
+        self.chargers[charger.config.key] = charger
+        charger.slot.worst_case = self.worst_case(charger)
+        self._look_again()
+
+    async def remove(self, charger: Charger) -> None:
+        """Take a charger off once its turn is over."""
+        while self._turn_of is not None and _belongs(self._turn_of, charger):
+            self._turn_over.clear()
+            await self._turn_over.wait()
+        self.chargers.pop(charger.config.key, None)
+        for job in self._jobs:
+            if job.charger is charger:
+                gone = NotAvailableError(f"{charger.config.name} was removed")
+                self._jobs.fail(job, gone)
+        charger.bus = None
+
+    def subscribe(self, listener: Callable[[], None]) -> Callable[[], None]:
+        """Call back when the port is lost or back; return how to stop."""
+        self._listeners.append(listener)
+        return partial(self._listeners.remove, listener)
+
+    # -- Commands ----------------------------------------------------------------
+
+    async def submit(self, job: Job) -> object:
+        """Queue a command and return its result.
+
+        Raises what its conversation raises, SupersededError when a newer one
+        took its place, LineLostError when the port is gone.
+        """
+        if self._stopping or self._task is None:
+            message = f"{self.name} is stopped"
+            raise NotAvailableError(message)
+        if not self.connected:
+            message = f"{self.name} is not connected"
+            raise LineLostError(message)
+        if (waiting := self._jobs.merge(job)) is not None:
+            self.wire.statistics.merged += 1
+            job = waiting
+        else:
+            self._jobs.add(job)
+            self._respect_minimum(job.charger)
+            self._look_again()
+        # Whoever waits may give up; the command itself is still carried out.
+        return await asyncio.shield(job.future)
+
+    async def run[T](self, step: Step[T], *, kind: Kind = Kind.PROBE) -> T:
+        """Have a conversation that belongs to no charger (a scan)."""
+        job = Job(
+            charger=None,
+            kind=kind,
+            due=asyncio.get_running_loop().time(),
+            worst_case=self.wire.exchange_time(),
+            step=step,
+        )
+        return await self.submit(job)  # type: ignore[return-value] # the step's own
+
+    def supersede(self, charger: Charger, which: Callable[[OrderChange], bool]) -> None:
+        """Drop waiting order changes that a newer command makes wrong."""
+        self._jobs.supersede(charger, which)
+
+    def worst_case(self, charger: Charger) -> float:
+        """Return the longest time one turn of a charger can take, s."""
+        return charger.exchanges_per_turn * self.wire.exchange_time(
+            charger.longest_request
+        )
+
+    # -- The one task that owns the line -----------------------------------------
+
+    async def _run(self) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            if not self.line.is_open and not await self._reopen():
+                return
+            slots = self._slots()
+            if self._stopping and not slots:
+                return
+            now = loop.time()
+            choice = choose(slots, now, self._last_probe)
+            if choice.slot is None:
+                await self._sleep_until(choice.wake_at)
+                continue
+            self.wire.statistics.for_deadline += choice.for_deadline
+            self._turn_of = choice.slot
+            try:
+                await self._turn(choice.slot, now)
+            finally:
+                self._turn_of = None
+                self._turn_over.set()
+                self.wire.statistics.busy(now, loop.time())
+
+    def _slots(self) -> list[Slot]:
+        if self._stopping:
+            return [job for job in self._jobs if job.begun]
+        slots: list[Slot] = [charger.slot for charger in self.chargers.values()]
+        slots.extend(self._jobs)
+        return slots
+
+    async def _turn(self, slot: Slot, now: float) -> None:
+        if slot.kind is Kind.PROBE:
+            self._last_probe = now
+        if isinstance(slot, Job):
+            charger = slot.charger
+        else:
+            charger = next(one for one in self.chargers.values() if one.slot is slot)
+        if charger is not None and now > charger.slot.start_by:
+            charger.statistics.missed_deadlines += 1
+            self.wire.statistics.missed_deadlines += 1
+        if isinstance(slot, Job):
+            await self._job_turn(slot)
+        elif charger is not None:
+            await self._poll_turn(charger)
+        self._respect_minimum(charger)
+
+    async def _poll_turn(self, charger: Charger) -> None:
+        loop = asyncio.get_running_loop()
+        before = charger.told
+        charger.expire_orders(loop.time())
+        try:
+            later = await charger.poll(Talk(self.wire, charger.statistics))
+        except LineError as error:
+            self._skip_poll(charger, error)
+            return
+        except ImplausibleReplyError as error:
+            # It did answer; what it said is held back and changes nothing.
+            _LOGGER.debug("%s: %s", charger.config.name, error)
+            charger.statistics.implausible += 1
+            charger.plan(loop.time())
+            return
+        except EvseError as error:
+            _LOGGER.debug("%s: %s", charger.config.name, error)
+            charger.missed(loop.time())
+            return
+        except Exception:
+            # A mistake of ours must not end the bus for everybody else.
+            _LOGGER.exception("%s: a poll failed unforeseen", charger.config.name)
+            charger.missed(loop.time())
+            return
+        now = loop.time()
+        charger.heard(now)
+        charger.plan(now)
+        if later is not None:
+            self._follow_up(charger, later, Persistence.STANDING)
+        if charger.told != before:
+            charger.updated()
+
+    def _skip_poll(self, charger: Charger, error: LineError) -> None:
+        """Leave a charger alone for a while when the line itself would not do."""
+        if not isinstance(error, LineLostError):
+            _LOGGER.debug("%s: %s", self.name, error)
+            self.wire.statistics.line_busy += 1
+        now = asyncio.get_running_loop().time()
+        charger.slot.ready = now + self.wire.timing.silence_patience
+
+    async def _job_turn(self, job: Job) -> None:
+        if job.future.cancelled():
+            self._jobs.fail(job, NotAvailableError("nobody waits for it"))
+            return
+        job.tries += 1
+        job.under_way = True
+        counted = job.charger.statistics if job.charger else ChargerStatistics()
+        try:
+            result = await job.step(Talk(self.wire, counted))
+        except ReplyTimeoutError as error:
+            self._again_or_fail(job, error)
+        except EvseError as error:
+            counted.refused += isinstance(error, ExchangeRefusedError)
+            self._jobs.fail(job, error)
+        except Exception as error:
+            # A mistake of ours must not end the bus for everybody else.
+            _LOGGER.exception("%s: a command failed unforeseen", self.name)
+            self._jobs.fail(job, EvseError(f"{type(error).__name__}: {error}"))
+        else:
+            if isinstance(result, Later):
+                job.step = result.step
+                job.ready = asyncio.get_running_loop().time() + result.pause
+                job.begun = True
+                job.tries = 0
+            else:
+                self._jobs.done(job, result)
+        finally:
+            job.under_way = False
+
+    def _again_or_fail(self, job: Job, error: ReplyTimeoutError) -> None:
+        timing = self.wire.timing
+        if (
+            job.persistence is Persistence.ONCE
+            or job.tries >= timing.attempts
+            or not self.connected
+        ):
+            self._jobs.fail(job, error)
+            return
+        self.wire.statistics.retries += 1
+        job.ready = asyncio.get_running_loop().time() + timing.retry_pauses[0]
+
+    def _follow_up(
+        self, charger: Charger, later: Later[None], persistence: Persistence
+    ) -> None:
+        """Queue a turn that nobody waits for."""
+        now = asyncio.get_running_loop().time()
+        self._jobs.add(
+            Job(
+                charger=charger,
+                kind=Kind.PAUSE,
+                ready=now + later.pause,
+                due=now,
+                worst_case=self.worst_case(charger),
+                step=later.step,
+                persistence=persistence,
+            )
+        )
+        self._look_again()
+
+    def _respect_minimum(self, charger: Charger | None) -> None:
+        """Let no command of a charger speak before its minimum interval."""
+        if charger is None:
+            return
+        now = asyncio.get_running_loop().time()
+        earliest = now + charger.minimum_pause(now)
+        for job in self._jobs:
+            if job.charger is charger:
+                job.ready = max(job.ready, earliest)
+
+    def _on_unasked(self, frame: Frame) -> bool:
+        for charger in tuple(self.chargers.values()):
+            if (step := charger.on_unsolicited(frame)) is not None:
+                self._follow_up(charger, Later(0.0, step), Persistence.ONCE)
+                return True
+        return False
+
+    # -- The port ----------------------------------------------------------------
+
+    def _on_open(self) -> None:
+        self.connected = True
+        self.wire.reset()
+        for charger in self.chargers.values():
+            charger.on_line_open()
+            charger.slot.ready = 0.0
+        self._tell()
+
+    def _on_lost(self, error: LineLostError) -> None:
+        _LOGGER.warning("%s: the port was lost (%s), trying again", self.name, error)
+        self.connected = False
+        self.wire.fail(error)
+        self._jobs.fail_all(error)
+        for charger in self.chargers.values():
+            charger.slot.start_by = inf
+            charger.set_unavailable()
+        self._tell()
+        self._look_again()
+
+    async def _reopen(self) -> bool:
+        """Open the port again, however long it takes; False when told to stop."""
+        pause = REOPEN_FIRST
+        while True:
+            if not self._stopping:
+                await self._sleep_until(asyncio.get_running_loop().time() + pause)
+            if self._stopping:
+                return False
+            try:
+                await self.line.open()
+            except LineError as error:
+                _LOGGER.debug("%s: still not there: %s", self.name, error)
+                pause = min(pause * 2, REOPEN_LIMIT)
+                continue
+            _LOGGER.warning("%s: the port is back", self.name)
+            self.wire.statistics.reopened += 1
+            self._on_open()
+            return True
+
+    def _tell(self) -> None:
+        for listener in tuple(self._listeners):
+            listener()
+
+    # -- Sleeping and waking -----------------------------------------------------
+
+    async def _sleep_until(self, wake_at: float) -> None:
+        loop = asyncio.get_running_loop()
+        self._wake = loop.create_future()
+        handle = None
+        if wake_at < inf:
+            handle = loop.call_at(wake_at, self._look_again)
+        try:
+            await self._wake
+        finally:
+            self._wake = None
+            if handle is not None:
+                handle.cancel()
+
+    def _look_again(self) -> None:
+        if self._wake is not None and not self._wake.done():
+            self._wake.set_result(None)
+
+
+def _belongs(slot: Slot, charger: Charger) -> bool:
+    return slot is charger.slot or (isinstance(slot, Job) and slot.charger is charger)

@@ -1,0 +1,315 @@
+"""What every charger shares, whatever it speaks: orders, presence, its turn.
+
+A protocol folder's charger derives from `Charger` and adds the conversation:
+what to ask, what to check, what to repeat. The rules for orders live here, so
+that they hold for every protocol alike:
+
+- a lowering counts (and is stored) before it is sent, a raise only after the
+  charger has confirmed it;
+- permission and limit are independent of each other;
+- an order that nobody renewed for its lifetime becomes the fail-safe value.
+"""
+
+from abc import ABC, abstractmethod
+import asyncio
+from collections.abc import Awaitable, Callable
+from functools import partial
+import logging
+from math import inf
+from typing import TYPE_CHECKING, ClassVar
+
+from .exchange import Talk
+from .framing import Frame, Timing
+from .jobs import Job, Later, Step
+from .model import (
+    Capability,
+    ChargerConfig,
+    ChargerInfo,
+    ChargerReading,
+    Command,
+    Fault,
+    Limits,
+    NotAvailableError,
+    OrderChange,
+    Orders,
+    Persistence,
+)
+from .safety import Setpoint, cautious, check_change, clamp, expired
+from .schedule import Kind, Slot
+from .statistics import ChargerStatistics
+
+if TYPE_CHECKING:
+    from .bus import Bus
+
+_LOGGER = logging.getLogger(__name__)
+
+
+class Charger(ABC):
+    """One charger on a bus."""
+
+    timing: ClassVar[Timing]
+
+    def __init__(self, config: ChargerConfig, orders: Orders) -> None:
+        """Take the orders that stand; nothing is sent before the bus starts."""
+        self.config = config
+        self.orders = orders
+        self.reading: ChargerReading | None = None
+        self.info: ChargerInfo | None = None
+        self.statistics = ChargerStatistics()
+        self.misses = 0
+        """Requests left unanswered in a row."""
+        self.available = False
+        """It answers, and what it said is what we know."""
+        self.noticed: frozenset[Fault] = frozenset()
+        """Faults that we noticed, beside those it told."""
+        self.orders_expired = False
+        """Nobody renewed the orders for their lifetime: the fail-safe counts."""
+        self.commit: Callable[[Orders], Awaitable[None]] = _no_commit
+        """Stores orders; awaited before a lowering is sent, after a raise."""
+        self.slot = Slot(kind=Kind.PROBE)
+        self.bus: Bus | None = None
+        self._renewed: float | None = None
+        self._listeners: list[Callable[[], None]] = []
+
+    # -- What it is and has ------------------------------------------------------
+
+    @property
+    @abstractmethod
+    def capabilities(self) -> frozenset[Capability]:
+        """Return what is known to be there; grows when more is learnt."""
+
+    @property
+    @abstractmethod
+    def limits(self) -> Limits:
+        """Return what no order may exceed now."""
+
+    @property
+    def effective_orders(self) -> Orders:
+        """Return the orders that count now, lifetime considered."""
+        return expired(self.orders) if self.orders_expired else self.orders
+
+    @property
+    def setpoint(self) -> Setpoint:
+        """Return what may be sent now."""
+        return clamp(self.effective_orders, self.limits)
+
+    @property
+    def told(self) -> tuple[object, ...]:
+        """Return all that listeners may care about, to see whether it changed."""
+        return (self.reading, self.available, self.noticed, self.info)
+
+    @property
+    def faults(self) -> frozenset[Fault]:
+        """Return the faults it told and those we noticed."""
+        told = self.reading.faults if self.reading else frozenset[Fault]()
+        return told | self.noticed
+
+    # -- The conversation --------------------------------------------------------
+
+    @abstractmethod
+    async def poll(self, talk: Talk) -> Later[None] | None:
+        """Have the regular exchange; may ask for a further turn."""
+
+    @abstractmethod
+    async def impose(self, talk: Talk, orders: Orders) -> None:
+        """Make the charger follow these orders, through `clamp`; return when sure.
+
+        Raises NotConfirmedError when the charger does not follow, and what
+        `Talk.exchange` raises.
+        """
+
+    @property
+    @abstractmethod
+    def longest_request(self) -> int:
+        """Return the bytes of its longest request."""
+
+    @property
+    def exchanges_per_turn(self) -> int:
+        """Return how many exchanges one turn may hold at most."""
+        return 1
+
+    def on_unsolicited(self, frame: Frame) -> Step[None] | None:  # noqa: ARG002
+        """Return an urgent turn for a frame nobody asked for; ``None``: not mine."""
+        return None
+
+    @abstractmethod
+    def on_line_open(self) -> None:
+        """Forget what must be checked anew after each (re)connect."""
+
+    def plan(self, now: float) -> None:
+        """Say in `slot` when the next regular exchange may and must be."""
+        self.slot.ready = self.slot.due = now + self.config.poll_interval
+
+    # -- What the bus tells ------------------------------------------------------
+
+    def heard(self, now: float) -> None:
+        """Note a good answer."""
+        self.misses = 0
+        self.slot.kind = Kind.POLL
+        self.slot.served = now
+        if not self.available:
+            self.available = True
+            _LOGGER.debug("%s answers", self.config.name)
+
+    def missed(self, now: float) -> None:
+        """Note an unanswered request; after some in a row the charger is gone."""
+        self.misses += 1
+        self.slot.kind = Kind.PROBE
+        self.slot.start_by = inf
+        pauses = self.timing.retry_pauses
+        if self.misses < self.timing.misses:
+            pause = pauses[min(self.misses, len(pauses)) - 1]
+        else:
+            doubled = 2 ** min(self.misses - self.timing.misses, 16)
+            pause = min(self.timing.backoff * doubled, self.timing.backoff_limit)
+            self.set_unavailable()
+        self.slot.ready = self.slot.due = now + max(pause, self.minimum_pause(now))
+
+    def minimum_pause(self, now: float) -> float:  # noqa: ARG002
+        """Return how long the charger must be left alone from now, s."""
+        return 0.0
+
+    def set_unavailable(self) -> None:
+        """Forget the reading: an old one is wrong, not a little out of date."""
+        was = self.available
+        self.available = False
+        self.reading = None
+        self.on_line_open()
+        if was:
+            self.updated()
+
+    # -- Orders ------------------------------------------------------------------
+
+    async def change_orders(self, change: OrderChange) -> None:
+        """Change orders; return when the charger has confirmed what stands now.
+
+        Raises RefusedOrderError for an unusable wish, SupersededError when a
+        newer command came first, NotAvailableError, NotConfirmedError,
+        ExchangeError or LineError when the charger does not follow. A lowering
+        stands all the same, and is sent as soon as the charger can hear it.
+        """
+        checked = check_change(change, self.limits)
+        loop = asyncio.get_running_loop()
+        self._renewed = loop.time()
+        self.orders_expired = False
+        lowered = cautious(self.orders, checked.apply(self.orders))
+        if lowered != self.orders:
+            self.orders = lowered
+            self.updated()
+            await self.commit(lowered)
+        bus = self._bus()
+        pause = checked.allowed is False
+        if pause:
+            bus.supersede(self, lambda waiting: waiting.allowed is True)
+        job = Job(
+            charger=self,
+            kind=Kind.PAUSE if pause else Kind.COMMAND,
+            due=loop.time(),
+            worst_case=bus.worst_case(self),
+            step=_nothing,
+            persistence=Persistence.STANDING,
+            merge_key=_merge_key(checked),
+            change=checked,
+        )
+        job.step = partial(self._impose_job, job)
+        await bus.submit(job)
+
+    async def _impose_job(self, job: Job, talk: Talk) -> None:
+        change = job.change or OrderChange()
+        target = change.apply(self.orders)
+        await self.impose(talk, target)
+        if target != self.orders:
+            self.orders = target
+            self.updated()
+            await self.commit(target)
+        else:
+            self.updated()
+
+    def expire_orders(self, now: float) -> bool:
+        """Note that the orders' lifetime is over; return whether it just ended."""
+        lifetime = self.config.order_lifetime
+        if lifetime is None or self.orders_expired:
+            return False
+        if self._renewed is None:
+            # Counted from the first turn: a restart gives automations their time.
+            self._renewed = now
+        if now - self._renewed < lifetime:
+            return False
+        self.orders_expired = True
+        _LOGGER.warning(
+            "%s: no automation has renewed its orders for %g s; "
+            "the fail-safe current counts until one does",
+            self.config.name,
+            lifetime,
+        )
+        self.updated()
+        return True
+
+    # -- Commands ----------------------------------------------------------------
+
+    async def command(
+        self,
+        command: Command,
+        value: bool | int | None = None,  # noqa: FBT001
+    ) -> None:
+        """Carry out a command; return when it is known to have worked.
+
+        Raises NotAvailableError where the charger has no such command, and what
+        `change_orders` raises.
+        """
+        message = f"{self.config.name} knows no command {command}: {value}"
+        raise NotAvailableError(message)
+
+    async def run[T](
+        self,
+        step: Step[T],
+        *,
+        persistence: Persistence = Persistence.ONCE,
+        kind: Kind = Kind.COMMAND,
+    ) -> T:
+        """Have a conversation of one's own with this charger; return its result."""
+        bus = self._bus()
+        job = Job(
+            charger=self,
+            kind=kind,
+            due=asyncio.get_running_loop().time(),
+            worst_case=bus.worst_case(self),
+            step=step,
+            persistence=persistence,
+        )
+        return await bus.submit(job)  # type: ignore[return-value]
+
+    def _bus(self) -> Bus:
+        if self.bus is None:
+            message = f"{self.config.name} is on no bus"
+            raise NotAvailableError(message)
+        return self.bus
+
+    # -- Listeners ---------------------------------------------------------------
+
+    def subscribe(self, listener: Callable[[], None]) -> Callable[[], None]:
+        """Call back after each change of what is known; return how to stop."""
+        self._listeners.append(listener)
+        return partial(self._listeners.remove, listener)
+
+    def updated(self) -> None:
+        """Tell the listeners."""
+        for listener in tuple(self._listeners):
+            listener()
+
+    def notice(self, fault: Fault, *, present: bool) -> None:
+        """Set or clear a fault that we noticed ourselves."""
+        self.noticed = self.noticed | {fault} if present else self.noticed - {fault}
+
+
+def _merge_key(change: OrderChange) -> str | None:
+    """Merge limits with limits; permission changes stay jobs of their own."""
+    return "limits" if change.allowed is None else None
+
+
+async def _no_commit(_orders: Orders) -> None:
+    """Store nothing: the default for a script without a store."""
+
+
+async def _nothing(_talk: Talk) -> None:
+    """Do nothing: the place of a step that is set right after."""

@@ -1,0 +1,229 @@
+"""One exchange on a line: silence, request, answer, time-out.
+
+Frames that answer nothing are handed on, or counted as other people's.
+"""
+
+import asyncio
+from collections.abc import Callable
+from typing import Final
+
+from .framing import Frame, Framer, Timing
+from .line import Line
+from .model import (
+    EvseError,
+    GarbledReplyError,
+    LineBusyError,
+    LineLostError,
+    ReplyTimeoutError,
+)
+from .statistics import BusStatistics, ChargerStatistics, Direction, FrameLog
+
+_BASE_REQUEST: Final = 64
+"""Longest request of a conversation that belongs to no charger, bytes."""
+
+
+class Wire:
+    """A line with frames on it; one exchange at a time."""
+
+    def __init__(self, line: Line, framer: Framer[Frame], timing: Timing) -> None:
+        """Listen to a line; `Line.open` is the caller's."""
+        self.line = line
+        self.timing = timing
+        self.statistics = BusStatistics()
+        self.frames = FrameLog()
+        self.on_unasked: Callable[[Frame], bool] = lambda _frame: False
+        """Called with a good frame that is no answer; returns whether it was ours."""
+        self._framer = framer
+        self._pending: _PendingReply | None = None
+        line.on_data = self._on_data
+
+    def exchange_time(self, request_bytes: int = _BASE_REQUEST) -> float:
+        """Return the longest time an exchange can take, time-out included, s."""
+        timing = self.timing
+        wire = (request_bytes + timing.longest_reply) * self.line.settings.byte_time
+        return timing.silence + wire + timing.reply_timeout + timing.gap
+
+    def reset(self) -> None:
+        """Forget a frame begun: the line was opened anew."""
+        self._framer.reset()
+
+    def fail(self, error: LineLostError) -> None:
+        """End the exchange under way: the line is gone."""
+        if self._pending is not None:
+            self._pending.fail(error)
+
+    async def exchange[F: Frame, T](
+        self,
+        request: bytes,
+        accept: Callable[[F], T | None],
+        counted: ChargerStatistics,
+        *,
+        reply_may_equal: bool = False,
+    ) -> T:
+        """Send a request and wait for its answer (see `Talk.exchange`)."""
+        await self._silence()
+        loop = asyncio.get_running_loop()
+        self._framer.reset()
+        bad, noise = self._framer.bad, self._framer.noise
+        started = loop.time()
+        sent = self.line.write(request, reply_may_equal=reply_may_equal)
+        pending = _PendingReply(
+            accept,
+            first_byte_by=sent + self.timing.reply_timeout,
+            longest=self.timing.longest_reply * self.line.settings.byte_time,
+            gap=self.timing.gap,
+        )
+        self._pending = pending
+        self.frames.add(Direction.OUT, request)
+        self.statistics.requests += 1
+        counted.requests += 1
+        try:
+            result = await pending.future
+        except ReplyTimeoutError as error:
+            self.statistics.timeouts += 1
+            counted.timeouts += 1
+            self._framer.reset()
+            unreadable = self._framer.bad - bad
+            if unreadable or self._framer.noise > noise:
+                counted.bad_frames += max(unreadable, 1)
+                message = "an answer came, but it could not be read"
+                raise GarbledReplyError(message) from error
+            raise
+        finally:
+            pending.close()
+            self._pending = None
+            if pending.answered_at is not None:
+                self.line.answered()
+                self.statistics.replies += 1
+                counted.reply(pending.answered_at - started)
+        return result  # type: ignore[return-value] # accept's own type
+
+    async def _silence(self) -> None:
+        """Wait until the line has been quiet for as long as the protocol asks."""
+        loop = asyncio.get_running_loop()
+        patience = loop.time() + self.timing.silence_patience
+        while True:
+            now = loop.time()
+            wait = self.line.last_activity + self.timing.silence - now
+            if wait <= 0:
+                return
+            if now + wait > patience:
+                message = "others keep talking, there is no silence to speak in"
+                raise LineBusyError(message)
+            await asyncio.sleep(wait)
+
+    def _on_data(self, data: bytes) -> None:
+        framer = self._framer
+        bad, noise = framer.bad, framer.noise
+        frames = framer.feed(data)
+        self.statistics.bad_frames += framer.bad - bad
+        self.statistics.noise_bytes += framer.noise - noise
+        if framer.bad > bad or framer.noise > noise:
+            self.frames.add(Direction.UNREADABLE, data)
+        for frame in frames:
+            self.statistics.frames += 1
+            self.frames.add(Direction.IN, frame.raw)
+            self._on_frame(frame)
+        if self._pending is not None and framer.pending:
+            self._pending.goes_on()
+
+    def _on_frame(self, frame: Frame) -> None:
+        if self._pending is not None and self._pending.offer(frame):
+            return
+        if self.on_unasked(frame):
+            self.statistics.unsolicited += 1
+        else:
+            self.statistics.foreign_frames += 1
+
+
+class Talk:
+    """What a conversation may do in its turn: exchanges, one after the other."""
+
+    def __init__(self, wire: Wire, counted: ChargerStatistics) -> None:
+        """Count what is said under one charger's name."""
+        self._wire = wire
+        self._counted = counted
+
+    @property
+    def now(self) -> float:
+        """Return the loop time, s."""
+        return asyncio.get_running_loop().time()
+
+    async def exchange[F: Frame, T](
+        self,
+        request: bytes,
+        accept: Callable[[F], T | None],
+        *,
+        reply_may_equal: bool = False,
+    ) -> T:
+        """Send a request and return what ``accept`` makes of its answer.
+
+        ``accept`` sees every good frame that comes: it returns ``None`` for one
+        that is not the answer, and raises for an answer that says no.
+
+        Raises ReplyTimeoutError, GarbledReplyError, LineBusyError, LineLostError
+        and what ``accept`` raises.
+        """
+        return await self._wire.exchange(
+            request, accept, self._counted, reply_may_equal=reply_may_equal
+        )
+
+
+class _PendingReply:
+    """The wait for one answer: until the first byte, then for as long as they come."""
+
+    def __init__(
+        self,
+        accept: Callable[..., object | None],
+        *,
+        first_byte_by: float,
+        longest: float,
+        gap: float,
+    ) -> None:
+        self._loop = asyncio.get_running_loop()
+        self.future: asyncio.Future[object] = self._loop.create_future()
+        self.answered_at: float | None = None
+        self._accept = accept
+        self._gap = gap
+        self._until = first_byte_by
+        # Noise that never ends must not hold the bus: this is the worst case.
+        self._last_chance = first_byte_by + longest + gap
+        self._timer = self._loop.call_at(first_byte_by, self._time_is_up)
+
+    def offer(self, frame: Frame) -> bool:
+        """Return whether this frame was the answer."""
+        if self.future.done():
+            return False
+        try:
+            result = self._accept(frame)
+        except Exception as error:  # noqa: BLE001 - it must reach whoever asked
+            self.future.set_exception(error)
+        else:
+            if result is None:
+                return False
+            self.future.set_result(result)
+        self.answered_at = self._loop.time()
+        return True
+
+    def goes_on(self) -> None:
+        """Give a frame that has begun the time to end."""
+        self._until = min(
+            max(self._until, self._loop.time() + self._gap), self._last_chance
+        )
+
+    def fail(self, error: EvseError) -> None:
+        """End the wait without an answer."""
+        if not self.future.done():
+            self.future.set_exception(error)
+
+    def _time_is_up(self) -> None:
+        if self.future.done():
+            return
+        if self._until > self._loop.time():
+            self._timer = self._loop.call_at(self._until, self._time_is_up)
+            return
+        self.future.set_exception(ReplyTimeoutError("no answer in time"))
+
+    def close(self) -> None:
+        """Leave no timer behind."""
+        self._timer.cancel()

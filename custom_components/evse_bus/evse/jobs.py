@@ -1,0 +1,124 @@
+"""Conversations that wait for the bus, and the queue they wait in."""
+
+import asyncio
+from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import dataclass, field
+import logging
+from typing import TYPE_CHECKING
+
+from .exchange import Talk
+from .model import EvseError, OrderChange, Persistence, SupersededError
+from .schedule import Slot
+
+if TYPE_CHECKING:
+    from .charger import Charger
+
+_LOGGER = logging.getLogger(__name__)
+
+type Step[T] = Callable[[Talk], Awaitable[T | Later[T]]]
+"""One turn of a conversation: returns its result, or what is to come later."""
+
+
+@dataclass(frozen=True, slots=True)
+class Later[T]:
+    """The rest of a conversation, after a pause in which others may speak."""
+
+    pause: float
+    """s"""
+    step: Step[T]
+
+
+@dataclass(slots=True, eq=False, kw_only=True)
+class Job(Slot):
+    """A command waiting for the bus."""
+
+    charger: Charger | None
+    step: Step[object]
+    persistence: Persistence = Persistence.ONCE
+    merge_key: str | None = None
+    """A newer waiting job of this charger with the same key is merged into it."""
+    change: OrderChange | None = None
+    """The order change it carries; merged jobs carry both."""
+    begun: bool = False
+    """Its first turn is over; the rest must be finished even when we stop."""
+    under_way: bool = False
+    """It has the bus right now."""
+    tries: int = 0
+    future: asyncio.Future[object] = field(
+        default_factory=lambda: asyncio.get_running_loop().create_future()
+    )
+
+
+class JobQueue:
+    """What waits for the bus besides the regular polls."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self._jobs: list[Job] = []
+
+    def __iter__(self) -> Iterator[Job]:
+        """Return what waits now; the queue may change meanwhile."""
+        return iter(tuple(self._jobs))
+
+    def __contains__(self, job: object) -> bool:
+        """Return whether a job still waits."""
+        return job in self._jobs
+
+    def add(self, job: Job) -> None:
+        """Let a job wait."""
+        self._jobs.append(job)
+
+    def merge(self, job: Job) -> Job | None:
+        """Merge a job into a waiting one of its kind, and return that, if any.
+
+        Only order changes merge, and only before they are under way: the newer
+        wish wins where both speak. A pause carries no merge key.
+        """
+        if job.merge_key is None or job.change is None:
+            return None
+        for waiting in self._jobs:
+            if (
+                waiting.charger is job.charger
+                and waiting.merge_key == job.merge_key
+                and waiting.change is not None
+                and not (waiting.begun or waiting.under_way)
+            ):
+                waiting.change = waiting.change.merged_with(job.change)
+                return waiting
+        return None
+
+    def supersede(self, charger: Charger, which: Callable[[OrderChange], bool]) -> None:
+        """Drop waiting order changes that a newer command makes wrong."""
+        for job in self:
+            if (
+                job.charger is charger
+                and job.change is not None
+                and not (job.begun or job.under_way)
+                and which(job.change)
+            ):
+                self.fail(job, SupersededError("a newer command came first"))
+
+    def done(self, job: Job, result: object) -> None:
+        """End a job well."""
+        self._remove(job)
+        if not job.future.done():
+            job.future.set_result(result)
+
+    def fail(self, job: Job, error: Exception) -> None:
+        """End a job badly; whoever waits for it is told."""
+        self._remove(job)
+        if not job.future.done():
+            job.future.set_exception(error)
+            # Nobody may be waiting any more (a follow-up of a poll): no warning.
+            job.future.exception()
+        _LOGGER.debug("A command failed: %s", error)
+
+    def fail_all(self, error: EvseError, *, begun: bool = True) -> None:
+        """End every waiting job; ``begun``: also those half done."""
+        for job in self:
+            if not job.under_way and (begun or not job.begun):
+                self.fail(job, error)
+
+    def _remove(self, job: Job) -> None:
+        if job in self._jobs:
+            self._jobs.remove(job)

@@ -1,0 +1,218 @@
+"""One serial line or socket: bytes out, bytes in, silence, echo.
+
+The line knows nothing of frames. It opens and closes one serialx connection,
+says in typed errors why it cannot, and strips the echo of our own bytes where
+the adapter hears itself (common on two-wire RS-485).
+"""
+
+import asyncio
+from contextlib import suppress
+from dataclasses import dataclass
+import errno
+import socket
+from typing import TYPE_CHECKING, override
+
+from serialx import Parity, SerialException, StopBits, create_serial_connection
+
+from .model import (
+    LineError,
+    LineLostError,
+    PortBusyError,
+    PortMissingError,
+    PortPermissionError,
+    PortSettingsError,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from serialx import BaseSerialTransport
+
+    from .framing import LineSettings
+
+OPEN_TIMEOUT = 10.0
+"""Longest wait for a port to open (a network port may not answer), s."""
+CLOSE_TIMEOUT = 5.0
+"""Longest wait for a port to close, s."""
+
+_PARITIES = {"N": Parity.NONE, "E": Parity.EVEN, "O": Parity.ODD}
+_STOP_BITS = {1: StopBits.ONE, 2: StopBits.TWO}
+
+_ERRORS: dict[int, type[LineError]] = {
+    errno.ENOENT: PortMissingError,
+    errno.ENODEV: PortMissingError,
+    errno.ENXIO: PortMissingError,
+    errno.EIO: PortMissingError,
+    errno.ENOTDIR: PortMissingError,
+    errno.EHOSTUNREACH: PortMissingError,
+    errno.ENETUNREACH: PortMissingError,
+    errno.EBUSY: PortBusyError,
+    errno.EACCES: PortPermissionError,
+    errno.EPERM: PortPermissionError,
+    errno.EINVAL: PortSettingsError,
+    errno.ENOTTY: PortSettingsError,
+}
+
+
+def line_error(error: Exception) -> LineError:
+    """Return why a port cannot be used, as one of our typed errors."""
+    # Order matters: a name that does not resolve and a time-out are OSErrors too.
+    if isinstance(error, (TimeoutError, ConnectionError, socket.gaierror)):
+        return PortMissingError(str(error) or type(error).__name__)
+    if isinstance(error, OSError):
+        kind = _ERRORS.get(error.errno or 0, LineError)
+        return kind(str(error))
+    if isinstance(error, (ValueError, SerialException)):
+        return PortSettingsError(str(error))
+    return LineError(str(error) or type(error).__name__)
+
+
+@dataclass(slots=True)
+class LineStatistics:
+    """What went over a line since it was made; survives reopening."""
+
+    bytes_out: int = 0
+    bytes_in: int = 0
+    echo_bytes: int = 0
+    opened: int = 0
+    lost: int = 0
+
+
+class Line:
+    """One serialx connection, half duplex."""
+
+    def __init__(self, url: str, settings: LineSettings) -> None:
+        """Remember where and how; nothing is opened yet."""
+        self.url = url
+        self.settings = settings
+        self.statistics = LineStatistics()
+        self.on_data: Callable[[bytes], None] = lambda _data: None
+        """Called with received bytes, echo already taken out."""
+        self.on_lost: Callable[[LineLostError], None] = lambda _error: None
+        """Called once when an open line is gone."""
+        self.last_activity = 0.0
+        """Loop time at which the last byte passed, in or out."""
+        self.echoes: bool | None = None
+        """Whether the adapter hears itself; ``None`` until seen."""
+        self._transport: BaseSerialTransport | None = None
+        self._echo = b""
+        self._held = 0
+
+    @property
+    def is_open(self) -> bool:
+        """Return whether bytes can be sent."""
+        return self._transport is not None
+
+    async def open(self) -> None:
+        """Open the port.
+
+        Raises PortMissingError, PortBusyError, PortPermissionError,
+        PortSettingsError or LineError.
+        """
+        loop = asyncio.get_running_loop()
+        try:
+            async with asyncio.timeout(OPEN_TIMEOUT):
+                transport, _ = await create_serial_connection(
+                    loop,
+                    lambda: _Receiver(self),
+                    self.url,
+                    baudrate=self.settings.baudrate,
+                    parity=_PARITIES[self.settings.parity],
+                    stopbits=_STOP_BITS[self.settings.stop_bits],
+                )
+        except (OSError, ValueError, SerialException) as error:
+            raise line_error(error) from error
+        self._transport = transport
+        self._echo = b""
+        self._held = 0
+        # Another adapter may have been plugged in meanwhile.
+        self.echoes = None
+        self.statistics.opened += 1
+        self.last_activity = loop.time()
+
+    async def close(self) -> None:
+        """Close the port; closing one that is gone is no error."""
+        transport, self._transport = self._transport, None
+        if transport is None:
+            return
+        transport.close()
+        # A port that was unplugged reports so once more here.
+        with suppress(OSError, SerialException):
+            async with asyncio.timeout(CLOSE_TIMEOUT):
+                await transport.wait_closed()
+
+    def write(self, data: bytes, *, reply_may_equal: bool = False) -> float:
+        """Send bytes; return the loop time at which the last one has left.
+
+        ``reply_may_equal`` says that an answer may be the same bytes (a Modbus
+        RTU write): then an echo is taken out only if the adapter is known to make
+        one. Raises LineLostError when the line is not open.
+        """
+        if self._transport is None:
+            message = f"{self.url} is not open"
+            raise LineLostError(message)
+        try:
+            self._transport.write(data)
+        except (OSError, SerialException) as error:
+            raise LineLostError(str(error)) from error
+        self.statistics.bytes_out += len(data)
+        now = asyncio.get_running_loop().time()
+        self.last_activity = now + len(data) * self.settings.byte_time
+        expect_echo = self.echoes if reply_may_equal else self.echoes is not False
+        self._echo = data if expect_echo else b""
+        self._held = 0
+        return self.last_activity
+
+    def _received(self, data: bytes) -> None:
+        self.statistics.bytes_in += len(data)
+        # A request still leaving the adapter keeps the line busy after this byte.
+        self.last_activity = max(self.last_activity, asyncio.get_running_loop().time())
+        if self._echo:
+            data = self._strip_echo(data)
+        if data:
+            self.on_data(data)
+
+    def _strip_echo(self, data: bytes) -> bytes:
+        """Take our own bytes off the front, or give back all that was held."""
+        rest = self._echo[self._held :]
+        length = min(len(rest), len(data))
+        if rest[:length] != data[:length]:
+            # Not an echo after all (or a damaged one): let the framer see it all.
+            held = self._echo[: self._held]
+            self._echo = b""
+            return held + data
+        self._held += length
+        if self._held < len(self._echo):
+            return b""
+        self.echoes = True
+        self.statistics.echo_bytes += len(self._echo)
+        self._echo = b""
+        return data[length:]
+
+    def answered(self) -> None:
+        """Note that an answer came: an adapter that had not echoed will not."""
+        if self.echoes is None:
+            self.echoes = False
+        self._echo = b""
+
+    def _lost(self, error: Exception | None) -> None:
+        if self._transport is None:
+            return
+        self._transport = None
+        self.statistics.lost += 1
+        self.on_lost(LineLostError(str(error) if error else "connection closed"))
+
+
+class _Receiver(asyncio.Protocol):
+    """Hands what serialx says to the line."""
+
+    def __init__(self, line: Line) -> None:
+        self._line = line
+
+    @override
+    def data_received(self, data: bytes) -> None:
+        self._line._received(data)  # noqa: SLF001 - one object in two classes
+
+    @override
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._line._lost(exc)  # noqa: SLF001 - one object in two classes

@@ -1,0 +1,441 @@
+"""The words every part shares: readings, orders, limits, commands, errors.
+
+Units throughout: ampere, volt, watt, watt-hour, second. ``None`` means "not
+told": no value is made up for what the wire does not say, and 0 is only ever a
+measured 0.
+
+This module imports nothing of the project and nothing of Home Assistant.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from enum import StrEnum
+
+MINIMUM_CURRENT = 6.0
+"""Lowest current a charger can offer a car, A (IEC 61851-1, annex A)."""
+
+MAXIMUM_CURRENT = 80.0
+"""Highest current a control pilot can offer a car, A (IEC 61851-1, annex A)."""
+
+type Phases[T] = tuple[T, T, T]
+"""One value for each of L1, L2, L3."""
+
+UNKNOWN_PHASES: Phases[float | None] = (None, None, None)
+
+
+class Status(StrEnum):
+    """State of a connector, in the words of OCPP 1.6."""
+
+    AVAILABLE = "available"
+    PREPARING = "preparing"
+    CHARGING = "charging"
+    SUSPENDED_EV = "suspended_ev"
+    SUSPENDED_EVSE = "suspended_evse"
+    FINISHING = "finishing"
+    UNAVAILABLE = "unavailable"
+    FAULTED = "faulted"
+
+
+class Fault(StrEnum):
+    """A named fault of a charger, or one that this library noticed itself."""
+
+    # Told by the charger (names after ABL EVCC2/3, annex 3.4 and register 0x06).
+    CONTACTOR_WELDED = "contactor_welded"
+    CONTACTOR_OPEN = "contactor_open"
+    INTERNAL = "internal"
+    DC_RESIDUAL_CURRENT = "dc_residual_current"
+    UPSTREAM_TIMEOUT = "upstream_timeout"
+    SOCKET_LOCK = "socket_lock"
+    CABLE_CODE = "cable_code"
+    VENTILATION_REQUESTED = "ventilation_requested"
+    PILOT = "pilot"
+    OVERCURRENT = "overcurrent"
+    TEMPERATURE = "temperature"
+    LOAD_IMBALANCE = "load_imbalance"
+    METER = "meter"
+    REDUCED_CURRENT = "reduced_current"
+    UNKNOWN = "unknown"
+    # Noticed by us.
+    LIMIT_EXCEEDED = "limit_exceeded"
+    LIMIT_NOT_TAKEN = "limit_not_taken"
+    WRONG_CHARGER = "wrong_charger"
+    DUPLICATE_ADDRESS = "duplicate_address"
+    IMPLAUSIBLE = "implausible"
+
+
+class Capability(StrEnum):
+    """Something that a charger has; an entity exists only for a capability."""
+
+    STATUS = "status"
+    RAW_STATE = "raw_state"
+    PLUGGED = "plugged"
+    CHARGING = "charging"
+    CURRENT = "current"
+    VOLTAGE = "voltage"
+    COS_PHI = "cos_phi"
+    POWER = "power"
+    ENERGY = "energy"
+    ESTIMATED_POWER = "estimated_power"
+    ESTIMATED_ENERGY = "estimated_energy"
+    OFFERED_CURRENT = "offered_current"
+    MAXIMUM_CURRENT = "maximum_current"
+    MINIMUM_CURRENT = "minimum_current"
+    FAULTS = "faults"
+    PHASE_LIMITS = "phase_limits"
+    FAIL_SAFE_CURRENT = "fail_safe_current"
+    FAIL_SAFE_TIMEOUT = "fail_safe_timeout"
+    UPSTREAM_TIMEOUT = "upstream_timeout"
+    ENABLE_AFTER_POWER_CYCLE = "enable_after_power_cycle"
+    OUTLET_ENABLED = "outlet_enabled"
+    RESET = "reset"
+    WAKE = "wake"
+    SET_ADDRESS = "set_address"
+
+
+class Persistence(StrEnum):
+    """How often a command may be sent for one wish."""
+
+    STANDING = "standing"
+    """Asserted again until it is read back, and for as long as it stands."""
+    REPEATABLE = "repeatable"
+    """Sending it twice does the same as sending it once."""
+    ONCE = "once"
+    """Never repeated blindly: after a lost answer, read the state, then decide."""
+
+
+class Command(StrEnum):
+    """Something a charger can be told beside its orders."""
+
+    RESET = "reset"
+    WAKE = "wake"
+    SET_OUTLET = "set_outlet"
+    """Value: bool, outlet enabled."""
+    SET_ADDRESS = "set_address"
+    """Value: int, the new address on the bus."""
+    SET_UPSTREAM_TIMEOUT = "set_upstream_timeout"
+    """Value: bool, the box's own fail-safe."""
+    SET_ENABLE_AFTER_POWER_CYCLE = "set_enable_after_power_cycle"
+    """Value: bool, a plugged car may charge after a power failure."""
+
+
+# -- What the user wants to stand ------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CurrentLimit:
+    """A wish for a current: a total and, where the protocol has them, phases.
+
+    The wish for a phase is ``min(current, phases[n])``.
+    """
+
+    current: float
+    """For all phases, A; 0 or at least the charger's minimum."""
+    phases: Phases[float | None] = UNKNOWN_PHASES
+    """For one phase, A; ``None``: only ``current`` counts."""
+
+    def effective(self) -> Phases[float]:
+        """Return the wish for L1, L2 and L3, A."""
+        one, two, three = (
+            self.current if phase is None else min(self.current, phase)
+            for phase in self.phases
+        )
+        return one, two, three
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Orders:
+    """What the user wants to stand for one charger. Never filled from a reading."""
+
+    limit: CurrentLimit
+    allowed: bool | None = None
+    """May charge; ``None``: nobody has said so or not, the charger decides."""
+    fail_safe: CurrentLimit = field(
+        default_factory=lambda: CurrentLimit(current=MINIMUM_CURRENT)
+    )
+    """What the charger falls back to when we fall silent; any value from 0."""
+    fail_safe_timeout: int = 60
+    """Silence after which it does so, s (EVBox only)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OrderChange:
+    """A change of some orders; ``None`` leaves a field as it is."""
+
+    allowed: bool | None = None
+    current: float | None = None
+    phases: Phases[float | None] = UNKNOWN_PHASES
+    """New limits of single phases, A; ``None`` leaves that phase as it is."""
+    fail_safe_current: float | None = None
+    fail_safe_phases: Phases[float | None] = UNKNOWN_PHASES
+    fail_safe_timeout: int | None = None
+
+    def apply(self, orders: Orders) -> Orders:
+        """Return the orders with this change made."""
+        return replace(
+            orders,
+            allowed=orders.allowed if self.allowed is None else self.allowed,
+            limit=_change_limit(orders.limit, self.current, self.phases),
+            fail_safe=_change_limit(
+                orders.fail_safe, self.fail_safe_current, self.fail_safe_phases
+            ),
+            fail_safe_timeout=(
+                orders.fail_safe_timeout
+                if self.fail_safe_timeout is None
+                else self.fail_safe_timeout
+            ),
+        )
+
+    def merged_with(self, newer: OrderChange) -> OrderChange:
+        """Return both changes as one; the newer wins where both speak."""
+        merged = {
+            item.name: (
+                getattr(self, item.name)
+                if getattr(newer, item.name) is None
+                else getattr(newer, item.name)
+            )
+            for item in fields(self)
+        }
+        for name in ("phases", "fail_safe_phases"):
+            merged[name] = tuple(
+                old if new is None else new
+                for old, new in zip(
+                    getattr(self, name), getattr(newer, name), strict=True
+                )
+            )
+        return OrderChange(**merged)
+
+
+def _change_limit(
+    limit: CurrentLimit, current: float | None, phases: Phases[float | None]
+) -> CurrentLimit:
+    one, two, three = (
+        old if new is None else new
+        for old, new in zip(limit.phases, phases, strict=True)
+    )
+    return CurrentLimit(
+        current=limit.current if current is None else current,
+        phases=(one, two, three),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Limits:
+    """What no order may exceed, and how fine the protocol can say it."""
+
+    installation: float
+    """Limit that the user typed for this installation, A."""
+    reports_maximum: bool = False
+    """The charger tells a maximum of its own; 6 A until it has."""
+    reported: float | None = None
+    """Smallest maximum the charger told (connection, hardware, cable), A."""
+    minimum: float = MINIMUM_CURRENT
+    """Lowest current other than 0 that this charger can offer, A."""
+    step: float = 0.1
+    """Step in which the protocol says currents, A."""
+
+    @property
+    def ceiling(self) -> float:
+        """Return the highest current that may reach the wire, A."""
+        if self.reported is not None:
+            return min(self.installation, self.reported)
+        if self.reports_maximum:
+            return min(self.installation, MINIMUM_CURRENT)
+        return self.installation
+
+
+# -- What the charger says -------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConnectorReading:
+    """What a charger told of one connector (EVBox: one ChargeBox module)."""
+
+    status: Status | None = None
+    raw_state: str | None = None
+    """The charger's own word: an IEC 61851 state such as ``C2``."""
+    plugged: bool | None = None
+    charging: bool | None = None
+    current: Phases[float | None] = UNKNOWN_PHASES
+    """Used current, A."""
+    voltage: Phases[float | None] = UNKNOWN_PHASES
+    cos_phi: Phases[float | None] = UNKNOWN_PHASES
+    power: float | None = None
+    """Power from measured voltage, current and cos phi, W."""
+    energy: float | None = None
+    """Meter total, Wh."""
+    estimated_power: float | None = None
+    """Power from measured current and a configured voltage, W."""
+    estimated_energy: float | None = None
+    """Estimated power summed since this object began to listen, Wh."""
+    minimum_current: float | None = None
+    """Current below which this connector cannot charge, A."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChargerReading:
+    """What a charger told of itself and of its connectors."""
+
+    connectors: Mapping[int, ConnectorReading] = field(default_factory=dict)
+    """By number, 1..n."""
+    allowed: bool | None = None
+    """Whether the charger lets a car charge, as the charger says it."""
+    offered_current: float | None = None
+    """Current offered to the car now, A; 0: charging is paused."""
+    maximum_current: float | None = None
+    """Maximum of the connection or the box, A."""
+    outlet_enabled: bool | None = None
+    faults: frozenset[Fault] = frozenset()
+    fault_codes: tuple[str, ...] = ()
+    """The charger's own codes for its faults, raw (``F9``)."""
+    details: Mapping[str, str | int | float | bool | None] = field(default_factory=dict)
+    """More that the charger told, for diagnostics only."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChargerInfo:
+    """What a charger is; does not change while it runs."""
+
+    manufacturer: str
+    model: str
+    serial: str | None = None
+    firmware: str | None = None
+    hardware: str | None = None
+    options: Mapping[str, str | int | bool | None] = field(default_factory=dict)
+    """Configuration bits the charger told, by name."""
+
+
+# -- How a charger is set up -----------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChargerConfig:
+    """What the user set up for one charger; protocols add their own fields."""
+
+    key: str
+    """Names the charger for as long as it is set up; not its address."""
+    name: str
+    address: int
+    """Where it is on the bus (ABL: device-ID; EVBox: serial number, 0: any)."""
+    serial: str | None = None
+    """Identity that must be found there before anything is written."""
+    installation_limit: float = MINIMUM_CURRENT
+    """Highest current the wiring of this charger may carry, A."""
+    voltage: float = 230.0
+    """Phase to neutral, V: for estimates where the wire tells none."""
+    poll_interval: float = 5.0
+    """Wanted time between two readings, s; 0: as fast as the bus goes."""
+    order_lifetime: float | None = None
+    """Time after which an order nobody renewed becomes the fail-safe, s."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FoundCharger:
+    """A charger that answered a scan."""
+
+    address: int
+    info: ChargerInfo
+    serial: str | None = None
+    maximum_current: float | None = None
+    """Maximum that it told, A."""
+    connectors: int = 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScanReport:
+    """What a scan of a bus found."""
+
+    found: tuple[FoundCharger, ...] = ()
+    duplicates: tuple[int, ...] = ()
+    """Addresses at which more than one charger answers."""
+    unreadable: bool = False
+    """Bytes came that no frame could be made of: wrong protocol or parity."""
+
+
+# -- Errors ----------------------------------------------------------------------
+
+
+class EvseError(Exception):
+    """Anything that this library raises on purpose."""
+
+
+class LineError(EvseError):
+    """The serial line cannot be used."""
+
+
+class PortMissingError(LineError):
+    """There is no such port, or the network address does not answer."""
+
+
+class PortBusyError(LineError):
+    """Another program has the port open."""
+
+
+class PortPermissionError(LineError):
+    """The port exists, and we may not open it."""
+
+
+class PortSettingsError(LineError):
+    """The port or its URL does not take these settings."""
+
+
+class LineLostError(LineError):
+    """The port was open and is gone (unplugged adapter, closed connection)."""
+
+
+class LineBusyError(LineError):
+    """Others kept talking: no silence to speak in."""
+
+
+class ExchangeError(EvseError):
+    """A request did not get a good answer."""
+
+
+class ReplyTimeoutError(ExchangeError):
+    """Nobody answered in time."""
+
+
+class GarbledReplyError(ReplyTimeoutError):
+    """Something answered, and no good frame could be made of it."""
+
+
+class ExchangeRefusedError(ExchangeError):
+    """The charger answered that it will not."""
+
+    def __init__(self, message: str, code: int | None = None) -> None:
+        """Keep the charger's own code beside the message."""
+        super().__init__(message)
+        self.code = code
+
+
+class ImplausibleReplyError(ExchangeError):
+    """A frame with good checksums that says what cannot be; held back."""
+
+
+class WrongChargerError(EvseError):
+    """Another charger answers at this address; nothing was written."""
+
+    def __init__(self, message: str, *, expected: str | None, found: str) -> None:
+        """Keep both identities for the message to the user."""
+        super().__init__(message)
+        self.expected = expected
+        self.found = found
+
+
+class DuplicateAddressError(EvseError):
+    """Two chargers answer at one address; nothing was written."""
+
+
+class NotConfirmedError(EvseError):
+    """A command was sent and the charger never confirmed it."""
+
+
+class SupersededError(EvseError):
+    """A newer command took the place of this one before it was sent."""
+
+
+class RefusedOrderError(EvseError, ValueError):
+    """A wish that is not a usable number, or out of what may be asked."""
+
+
+class NotAvailableError(EvseError):
+    """The charger does not answer, or is not in a state for this command."""

@@ -1,0 +1,45 @@
+"""What a protocol folder offers to the bus and to whoever sets one up."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from .bus import Bus
+from .line import Line
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from .charger import Charger
+    from .framing import Frame, Framer, LineSettings, Timing
+    from .model import ChargerConfig, Orders, ScanReport
+
+type Progress = Callable[[float], None]
+"""Called with the share of a scan that is done, 0..1."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Protocol:
+    """One protocol: how its line looks, and how to make and find its chargers."""
+
+    key: str
+    name: str
+    settings: LineSettings
+    timing: Timing
+    framer: Callable[[], Framer[Frame]]
+    config: type[ChargerConfig]
+    """What a charger of this protocol is set up with."""
+    charger: Callable[[ChargerConfig, Orders], Charger]
+    scan: Callable[[Bus, ChargerConfig, Orders, Progress], Awaitable[ScanReport]]
+    """Look for chargers on a started bus: ``scan(bus, config, orders, progress)``.
+
+    ``config`` and ``orders`` are what is imposed where `probe_imposes` is true.
+    """
+    probe_imposes: bool = False
+    """Every message sets limits, so a scan does too: ask for the values first."""
+
+    def bus(
+        self, url: str, *, settings: LineSettings | None = None, name: str = ""
+    ) -> Bus:
+        """Return a bus of this protocol on a port; `Bus.start` opens it."""
+        line = Line(url, settings or self.settings)
+        return Bus(line, self.framer(), self.timing, name)

@@ -1,0 +1,11 @@
+"""The registry of protocols: one line a protocol."""
+
+from typing import Final
+
+from .abl import PROTOCOL as ABL
+from .evbox import PROTOCOL as EVBOX
+from .protocol import Protocol
+
+PROTOCOLS: Final[dict[str, Protocol]] = {
+    protocol.key: protocol for protocol in (EVBOX, ABL)
+}

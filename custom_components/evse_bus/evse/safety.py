@@ -1,0 +1,209 @@
+"""From a wish to a set-point: the only way to an encoder. Pure functions.
+
+Every number that reaches a charger's wire as a current comes out of `clamp`.
+Encoders take a `Setpoint`, and only this module makes one (a test holds that).
+"""
+
+from dataclasses import dataclass
+from decimal import ROUND_FLOOR, Decimal
+from math import isfinite
+from numbers import Real
+from typing import TYPE_CHECKING
+
+from .model import CurrentLimit, OrderChange, Orders, RefusedOrderError
+
+if TYPE_CHECKING:
+    from .model import Limits, Phases
+
+MAXIMUM_TIMEOUT = 0xFFFF
+"""Longest fail-safe time-out a protocol can say, s (EVBox: one word)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Setpoint:
+    """Currents that may go to the wire, A, already clamped and rounded down."""
+
+    currents: Phases[float]
+    """For L1, L2, L3: each 0 or from the minimum to the ceiling."""
+    fail_safe: Phases[float]
+    """For L1, L2, L3 after silence: each from 0 to the ceiling."""
+    fail_safe_timeout: int
+    """s, at least 1."""
+
+    @property
+    def paused(self) -> bool:
+        """Return whether no phase may carry current: the protocol's real pause."""
+        return not any(self.currents)
+
+    @property
+    def current(self) -> float:
+        """Return the one current of a protocol without phases: the smallest, A."""
+        return min(self.currents)
+
+
+def number(value: object, what: str = "value") -> float:
+    """Return a wish as a finite, non-negative float.
+
+    Raises RefusedOrderError for anything else: NaN passes Home Assistant's own
+    range check, and a bool or a string is nobody's current.
+    """
+    if isinstance(value, bool) or not isinstance(value, (Real, Decimal)):
+        message = f"{what} is not a number: {value!r}"
+        raise RefusedOrderError(message)
+    result = float(value)
+    if not isfinite(result):
+        message = f"{what} is not a finite number: {value!r}"
+        raise RefusedOrderError(message)
+    if result < 0:
+        message = f"{what} is negative: {value!r}"
+        raise RefusedOrderError(message)
+    return result
+
+
+def round_down(value: float, step: float) -> float:
+    """Return the highest multiple of ``step`` that is not above ``value``, A.
+
+    Decimal, because ``6.9 // 0.1`` is 68 in binary floating point, and a value
+    that is already a multiple of the step must stay what it is.
+    """
+    grid = Decimal(repr(step))
+    steps = (Decimal(repr(value)) / grid).to_integral_value(ROUND_FLOOR)
+    return float(steps * grid)
+
+
+def clamp(orders: Orders, limits: Limits) -> Setpoint:
+    """Return what may be sent for these orders within these limits.
+
+    Raises RefusedOrderError when an order is not a finite number from 0.
+    """
+    if orders.allowed is False:
+        currents: Phases[float] = (0.0, 0.0, 0.0)
+        # The wish behind a pause is checked all the same: a bad one must not wait.
+        _clamp_limit(orders.limit, limits)
+    else:
+        one, two, three = (
+            value if value >= limits.minimum else 0.0
+            for value in _clamp_limit(orders.limit, limits)
+        )
+        currents = (one, two, three)
+    return Setpoint(
+        currents=currents,
+        fail_safe=_clamp_limit(orders.fail_safe, limits),
+        fail_safe_timeout=_clamp_timeout(orders.fail_safe_timeout),
+    )
+
+
+def _clamp_limit(limit: CurrentLimit, limits: Limits) -> Phases[float]:
+    ceiling = number(limits.ceiling, "ceiling")
+    # Each wish on its own first: min() lets a NaN through or not by its place.
+    for wish in (limit.current, *limit.phases):
+        if wish is not None:
+            number(wish, "current")
+    one, two, three = (
+        round_down(min(value, ceiling), limits.step) for value in limit.effective()
+    )
+    return one, two, three
+
+
+def _clamp_timeout(value: int) -> int:
+    seconds = number(value, "fail-safe time-out")
+    return int(min(max(seconds, 1), MAXIMUM_TIMEOUT))
+
+
+def check_change(change: OrderChange, limits: Limits) -> OrderChange:
+    """Return a change as it will be stored: finite and on the protocol's step.
+
+    A current is 0 or at least the minimum, and not above the installation limit;
+    a phase and a fail-safe current may be anything up to that (a phase: 0 or at
+    least the minimum). Raises RefusedOrderError for anything else.
+    """
+    return OrderChange(
+        allowed=change.allowed,
+        current=_check(change.current, limits, "current", above_minimum=True),
+        phases=_check_phases(change.phases, limits, "phase", above_minimum=True),
+        fail_safe_current=_check(change.fail_safe_current, limits, "fail-safe"),
+        fail_safe_phases=_check_phases(
+            change.fail_safe_phases, limits, "fail-safe phase"
+        ),
+        fail_safe_timeout=_check_timeout(change.fail_safe_timeout),
+    )
+
+
+def _check_phases(
+    phases: Phases[float | None],
+    limits: Limits,
+    what: str,
+    *,
+    above_minimum: bool = False,
+) -> Phases[float | None]:
+    one, two, three = (
+        _check(value, limits, what, above_minimum=above_minimum) for value in phases
+    )
+    return one, two, three
+
+
+def _check(
+    value: float | None, limits: Limits, what: str, *, above_minimum: bool = False
+) -> float | None:
+    if value is None:
+        return None
+    checked = number(value, what)
+    if checked > limits.installation:
+        message = f"{what} {checked:g} A is above the {limits.installation:g} A limit"
+        raise RefusedOrderError(message)
+    if above_minimum and 0 < checked < limits.minimum:
+        message = f"{what} {checked:g} A is below the minimum {limits.minimum:g} A"
+        raise RefusedOrderError(message)
+    return round_down(checked, limits.step)
+
+
+def _check_timeout(value: int | None) -> int | None:
+    if value is None:
+        return None
+    seconds = number(value, "fail-safe time-out")
+    if not 1 <= seconds <= MAXIMUM_TIMEOUT:
+        message = f"fail-safe time-out {seconds:g} s is not within 1..{MAXIMUM_TIMEOUT}"
+        raise RefusedOrderError(message)
+    return int(seconds)
+
+
+def cautious(old: Orders, new: Orders) -> Orders:
+    """Return the lower of two sets of orders, field by field.
+
+    This is what is stored before a change is sent: a lowering counts at once, a
+    raise only when the charger has confirmed it. Whether a longer time-out is
+    the more careful one nobody can say; the new one waits for the answer.
+    """
+    return Orders(
+        allowed=_less_allowed(old.allowed, new.allowed),
+        limit=_lower_limit(old.limit, new.limit),
+        fail_safe=_lower_limit(old.fail_safe, new.fail_safe),
+        fail_safe_timeout=old.fail_safe_timeout,
+    )
+
+
+def _less_allowed(old: bool | None, new: bool | None) -> bool | None:  # noqa: FBT001
+    if old is False or new is False:
+        return False
+    return old
+
+
+def _lower_limit(old: CurrentLimit, new: CurrentLimit) -> CurrentLimit:
+    one, two, three = (
+        second if first is None else first if second is None else min(first, second)
+        for first, second in zip(old.phases, new.phases, strict=True)
+    )
+    return CurrentLimit(current=min(old.current, new.current), phases=(one, two, three))
+
+
+def expired(orders: Orders) -> Orders:
+    """Return orders that nobody renewed in time: the fail-safe as the limit.
+
+    Permission stays what it is: no passing of time starts a stopped car.
+    """
+    return Orders(
+        allowed=orders.allowed,
+        limit=orders.fail_safe,
+        fail_safe=orders.fail_safe,
+        fail_safe_timeout=orders.fail_safe_timeout,
+    )

@@ -1,0 +1,124 @@
+"""Who speaks next on a bus: a pure function of what waits and of the time.
+
+The rules (they are the bus's promises, each with a test):
+
+- hard deadlines first: nothing is started whose worst case would make one late;
+- then commands, a pause before any other;
+- then polls, earliest due first;
+- then probes of chargers that do not answer. Where the living keep the bus busy
+  all the time, one probe is let in after each of them has had its turn, so that
+  a dead charger costs a living one at most one reply time-out a round.
+"""
+
+from dataclasses import dataclass, field
+from enum import IntEnum
+from math import inf
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+
+class Kind(IntEnum):
+    """What a turn is for, the most urgent first."""
+
+    PAUSE = 0
+    COMMAND = 1
+    POLL = 2
+    PROBE = 3
+
+
+@dataclass(slots=True, eq=False, kw_only=True)
+class Slot:
+    """Something that wants the bus. All times are loop times, s."""
+
+    kind: Kind
+    ready: float = 0.0
+    """Not before this (minimum interval, retry pause, back-off)."""
+    due: float = 0.0
+    """Order among slots of one kind: the earliest first."""
+    start_by: float = inf
+    """Hard deadline: must have been started by then."""
+    worst_case: float = 0.0
+    """Longest time one turn can take, time-out included, s."""
+    served: float = field(default=-inf)
+    """When it last had a turn."""
+
+
+@dataclass(frozen=True, slots=True)
+class Choice[S: Slot]:
+    """The slot to serve now, or else when to look again."""
+
+    slot: S | None
+    wake_at: float = inf
+    for_deadline: bool = False
+    """It was taken because a deadline left room for nothing else."""
+
+
+def choose[S: Slot](slots: Sequence[S], now: float, last_probe: float) -> Choice[S]:
+    """Return who speaks now.
+
+    ``last_probe`` is when the last probe was started (-inf: never).
+    """
+    waiting = sorted((slot for slot in slots if slot.ready <= now), key=_order)
+    deadlines = sorted(
+        (slot for slot in slots if slot.start_by < inf), key=lambda slot: slot.start_by
+    )
+    probe = _probe_let_in(waiting, last_probe)
+    candidates = _with_probe(waiting, probe)
+    for slot in candidates:
+        if _leaves_room(slot, deadlines, now):
+            return Choice(slot)
+    # Nothing ordinary fits before a deadline: serve the deadline itself.
+    for slot in deadlines:
+        if slot.ready <= now and (candidates or slot.start_by <= now):
+            return Choice(slot, for_deadline=True)
+    return Choice(None, wake_at=_next_look(slots, deadlines, now))
+
+
+def _order(slot: Slot) -> tuple[int, float]:
+    return (slot.kind, slot.due)
+
+
+def _probe_let_in[S: Slot](waiting: Iterable[S], last_probe: float) -> S | None:
+    """Return the probe that has waited for a whole round of the living, if any."""
+    first: S | None = None
+    for slot in waiting:
+        if slot.kind is Kind.PROBE:
+            if first is None:
+                first = slot
+        elif slot.kind is Kind.POLL and slot.served < last_probe:
+            return None
+    return first
+
+
+def _with_probe[S: Slot](waiting: list[S], probe: S | None) -> list[S]:
+    """Return the order of service with one probe ranked as a poll."""
+    if probe is None:
+        return waiting
+    return sorted(
+        waiting,
+        key=lambda slot: (
+            (Kind.POLL, slot.due) if slot is probe else (slot.kind, slot.due)
+        ),
+    )
+
+
+def _leaves_room(slot: Slot, deadlines: Iterable[Slot], now: float) -> bool:
+    """Return whether every other deadline can still be met after this turn."""
+    end = now + slot.worst_case
+    for other in deadlines:
+        if other is slot:
+            continue
+        start = max(end, other.ready)
+        if start > other.start_by:
+            return False
+        end = start + other.worst_case
+    return True
+
+
+def _next_look(slots: Iterable[Slot], deadlines: Iterable[Slot], now: float) -> float:
+    """Return when something becomes ready, or has to go out after all."""
+    times = [slot.ready for slot in slots if slot.ready > now]
+    times.extend(max(slot.start_by, slot.ready) for slot in deadlines)
+    return min(times, default=inf)

@@ -1,0 +1,127 @@
+"""What a bus counts, and the last frames that passed on it."""
+
+from collections import deque
+from dataclasses import dataclass, field
+from enum import StrEnum
+from math import inf
+from time import time
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+WINDOW: Final = 60.0
+"""Time over which utilisation is told, s."""
+KEPT_FRAMES: Final = 200
+
+
+@dataclass(slots=True)
+class BusStatistics:
+    """Counted since the bus was made; survives a lost port."""
+
+    requests: int = 0
+    replies: int = 0
+    timeouts: int = 0
+    retries: int = 0
+    merged: int = 0
+    """Limits that a newer one replaced before they were sent."""
+    frames: int = 0
+    bad_frames: int = 0
+    foreign_frames: int = 0
+    """Good frames that were nobody's answer: late, or other people's."""
+    unsolicited: int = 0
+    noise_bytes: int = 0
+    missed_deadlines: int = 0
+    for_deadline: int = 0
+    """Turns taken early because a deadline left room for nothing else."""
+    line_busy: int = 0
+    """Turns given up because others kept talking."""
+    reopened: int = 0
+    busy_time: float = 0.0
+    """Time in which an exchange was under way, s."""
+    _marks: deque[tuple[float, float]] = field(default_factory=deque)
+
+    def busy(self, start: float, end: float) -> None:
+        """Note that the bus was in use from start to end (loop times)."""
+        self.busy_time += end - start
+        if not self._marks or end - self._marks[-1][0] >= WINDOW / 12:
+            self._marks.append((end, self.busy_time))
+            while len(self._marks) > 1 and end - self._marks[1][0] > WINDOW:
+                self._marks.popleft()
+
+    def utilisation(self, now: float) -> float | None:
+        """Return the share of the last minute in which the bus was in use, 0..1."""
+        if not self._marks:
+            return None
+        since, before = self._marks[0]
+        if now <= since:
+            return None
+        return min((self.busy_time - before) / (now - since), 1.0)
+
+
+@dataclass(slots=True)
+class ChargerStatistics:
+    """What the bus noticed of one charger."""
+
+    requests: int = 0
+    replies: int = 0
+    timeouts: int = 0
+    bad_frames: int = 0
+    refused: int = 0
+    reasserted: int = 0
+    """How often a limit had to be sent again because the box stood above it."""
+    implausible: int = 0
+    missed_deadlines: int = 0
+    round_trip_min: float = inf
+    round_trip_max: float = 0.0
+    round_trip_sum: float = 0.0
+
+    def reply(self, took: float) -> None:
+        """Count an answer; ``took``: from the request's first byte on, s."""
+        self.replies += 1
+        self.round_trip_sum += took
+        self.round_trip_min = min(self.round_trip_min, took)
+        self.round_trip_max = max(self.round_trip_max, took)
+
+    @property
+    def round_trip_mean(self) -> float | None:
+        """Return the mean time from a request's first byte to its answer, s."""
+        return self.round_trip_sum / self.replies if self.replies else None
+
+
+class Direction(StrEnum):
+    """Which way a frame went."""
+
+    OUT = "out"
+    IN = "in"
+    UNREADABLE = "unreadable"
+
+
+@dataclass(frozen=True, slots=True)
+class LoggedFrame:
+    """One frame as it passed."""
+
+    when: float
+    """Seconds since the epoch."""
+    direction: Direction
+    data: bytes
+
+
+class FrameLog:
+    """The last frames on a bus, for diagnostics."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self._frames: deque[LoggedFrame] = deque(maxlen=KEPT_FRAMES)
+
+    def add(self, direction: Direction, data: bytes) -> None:
+        """Remember a frame; the oldest one is forgotten."""
+        self._frames.append(LoggedFrame(time(), direction, data))
+
+    def __iter__(self) -> Iterator[LoggedFrame]:
+        """Return the frames, oldest first."""
+        return iter(tuple(self._frames))
+
+    def __len__(self) -> int:
+        """Return how many are kept."""
+        return len(self._frames)
