@@ -1,0 +1,49 @@
+"""Virtual chargers on a virtual RS-485 bus: the independent witness of the tests.
+
+Written from the manuals alone; nothing here imports the integration. Example::
+
+    from tests.virtual import AblBox, Car, VirtualBus, requests_in
+
+    car = Car(max_current=16)
+    box = AblBox(1, car=car)
+    with VirtualBus.pty(box, time_scale=10) as bus:   # or VirtualBus.tcp(box)
+        client = open_my_client(bus.url)              # a path, or socket://127.0.0.1:n
+        car.plug_in()
+        bus.wait_for(lambda: box.state == "C2")       # or: await bus.wait_for_async(...)
+        box.faults.once("lose")                       # the next reply never comes
+        bus.unplug(); bus.replug()                    # the adapter
+        assert all(r.register != 0x05 for r in requests_in(bus.log.bursts()))
+"""
+
+from .abl import AblBox, Write
+from .abl_frames import Request, amps_of, duty_of, requests_in
+from .abl_outlet import Outlet
+from .bus import VirtualBus
+from .car import Car, CarLife
+from .device import Device
+from .evbox import EvboxChargePoint, Module
+from .evbox_frames import Order, orders_in
+from .faults import Faults
+from .log import CLIENT, Entry, TrafficLog
+
+__all__ = [
+    "CLIENT",
+    "AblBox",
+    "Car",
+    "CarLife",
+    "Device",
+    "Entry",
+    "EvboxChargePoint",
+    "Faults",
+    "Module",
+    "Order",
+    "Outlet",
+    "Request",
+    "TrafficLog",
+    "VirtualBus",
+    "Write",
+    "amps_of",
+    "duty_of",
+    "orders_in",
+    "requests_in",
+]

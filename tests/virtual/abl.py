@@ -1,0 +1,319 @@
+"""A virtual ABL EVCC2/3 on the bus, written from the manual."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+from .abl_frames import (
+    BROADCAST,
+    FAILURE,
+    LOWEST_DUTY,
+    NO_CURRENT,
+    READ,
+    WRITE,
+    WRITE_FAILED,
+    LineFinder,
+    Request,
+    line,
+)
+from .abl_outlet import Outlet
+from .abl_registers import BLOCKS, BROADCAST_READS, EXTRA_BLOCKS
+from .device import Device, on_bus_thread
+
+if TYPE_CHECKING:
+    from .car import Car
+    from .wire import Segment
+
+WRITABLE = frozenset({0x05, 0x14, 0x2C})
+RESET = 0x5A5A
+LAST_ID = 16
+FIELD_ON, FIELD_OFF = 0b10, 0b01
+
+
+@dataclass(frozen=True, slots=True)
+class Write:
+    """A write that reached the box: when (real time), what, and what became of it."""
+
+    t: float
+    register: int
+    value: int
+    accepted: bool
+    broadcast: bool
+
+
+class AblBox(Device):
+    """An ABL wallbox; `outlet` is its inside (states, limits, meter, car).
+
+    - `device_id`: 1 to 16; `serial`: 14 characters
+    - `writes`: every write it understood
+    - `answer_register`: told in place of the right register number (a defect)
+    - `unreadable_in_b2`: reports 0x3E8 also in B2; `l3_first`: phase order reversed
+    - `sleep_after` (s, None = never), `wake_time`, `wakes_on`: see the README
+    """
+
+    parity: ClassVar[str] = "E"
+    protocol: ClassVar[str] = "abl"
+
+    def __init__(
+        self,
+        device_id: int = 1,
+        *,
+        car: Car | None = None,
+        serial: str = "2W22xy01234567",
+        default_current: float = 16.0,
+        cable_current: float | None = None,
+        meter: bool = True,
+        upstream_enabled: bool = False,
+        upstream_timeout: float = 30.0,
+        enable_input: int = 0,
+        sleep_after: float | None = None,
+        wake_time: float = 0.3,
+        wakes_on: Literal["any", "own"] = "any",
+        extra_registers: bool = False,
+        turn_round: float = 0.002,
+        jitter: float = 0.0005,
+        boot_time: float = 0.3,
+        firmware: tuple[int, int] = (1, 2),
+        hardware: int = 0b01,
+        name: str = "",
+    ) -> None:
+        """Make a box waiting for a car."""
+        super().__init__(name or f"abl-{device_id}")
+        self.device_id = device_id
+        self.serial = serial
+        self.outlet = Outlet(
+            car,
+            default_current=default_current,
+            cable_current=cable_current,
+            meter=meter,
+            upstream_enabled=upstream_enabled,
+            upstream_timeout=upstream_timeout,
+            enable_input=enable_input,
+        )
+        self.firmware = firmware
+        self.hardware = hardware
+        self.coding_resistor = cable_current is not None
+        self.rdc_md = True
+        self.welding_detection = True
+        self.sleep_after = sleep_after
+        self.wake_time = wake_time
+        self.wakes_on = wakes_on
+        self.extra_registers = extra_registers
+        self.turn_round = turn_round
+        self.jitter = jitter
+        self.boot_time = boot_time
+        self.answer_register: int | None = None
+        self.unreadable_in_b2 = False
+        self.l3_first = False
+        self.writes: list[Write] = []
+        self.refused = 0
+        self.ignored = 0
+        self.lost_asleep = 0
+        self.resets = 0
+        self._finder = LineFinder()
+        self._deaf_until = float("-inf")
+        self._active_at: float | None = None
+        self._configuration = 0
+        self._contacted = False
+
+    # What a test looks at, or does
+
+    @property
+    def state(self) -> str:
+        """Return the state's name: A1, B2, C2, E0, F4..."""
+        return self.outlet.state
+
+    @property
+    def ic_amps(self) -> float:
+        """Return what the car may draw, A per phase (0 = pause)."""
+        return self.outlet.ic_amps
+
+    @property
+    def asleep(self) -> bool:
+        """Tell whether the next request will be lost."""
+        if self.sleep_after is None:
+            return False
+        if self._active_at is None:
+            return True
+        return self.now() - self._active_at > self.sleep_after
+
+    @property
+    def limits_written(self) -> list[int]:
+        """Return the values of 0x14 that were accepted, oldest first."""
+        return [w.value for w in self.writes if w.register == 0x14 and w.accepted]
+
+    @on_bus_thread
+    def power_cycle(self) -> None:
+        """Lose power for a moment: Icmax is Idefault again, a new ID holds."""
+        self._reset()
+
+    @on_bus_thread
+    def stop_locally(self) -> None:
+        """Disable the outlet, as by a key switch: E0."""
+        self.outlet.stop_locally()
+
+    @on_bus_thread
+    def start_locally(self) -> None:
+        """Enable the outlet again at the box."""
+        self.outlet.start_locally()
+
+    @on_bus_thread
+    def fail(self, number: int) -> None:
+        """Go to failure F<number>."""
+        self.outlet.fail(number)
+
+    @on_bus_thread
+    def clear_failure(self) -> None:
+        """Leave a failure."""
+        self.outlet.clear_failure()
+
+    @on_bus_thread
+    def set_by_somebody(self, amps: float) -> None:
+        """Let somebody else set Icmax behind the master's back."""
+        self.outlet.set_by_somebody(amps)
+
+    def stats(self) -> dict[str, object]:
+        """Return the counters."""
+        return {
+            **super().stats(),
+            "bad_frames": self._finder.bad,
+            "refused": self.refused,
+            "ignored": self.ignored,
+            "lost_asleep": self.lost_asleep,
+            "writes": len(self.writes),
+            "state": self.state,
+            "ic_amps": round(self.ic_amps, 2),
+        }
+
+    # On the bus
+
+    def step(self) -> None:
+        """Bring the outlet up to now."""
+        now = self.now()
+        if not self._contacted:
+            # The time without polling is counted from the moment of power-up.
+            self._contacted = True
+            self.outlet.contact(now)
+        self.outlet.step(now)
+
+    def hear(self, segment: Segment) -> None:
+        """Hear bytes; answer a request that is meant for us."""
+        if segment.end <= self._deaf_until:
+            return
+        asleep = self.asleep
+        if self.wakes_on == "any":
+            self._active_at = self.now()
+            if asleep:
+                self._wake(segment)
+                return
+        for request in self._finder.feed(segment):
+            if request.device_id not in (self.device_id, BROADCAST):
+                continue
+            self._active_at = self.now()
+            if asleep:
+                self._wake(segment)
+                return
+            self.requests += 1
+            self.step()
+            self.outlet.contact(self.now())
+            answer = self._answer(request)
+            if answer is None:
+                self.ignored += 1
+            else:
+                wait = self.turn_round
+                if self.bus is not None:
+                    wait += self.bus.rng.random() * self.jitter
+                self.send(answer, wait)
+
+    def _wake(self, segment: Segment) -> None:
+        self.lost_asleep += 1
+        self._deaf_until = segment.end + self.wake_time
+
+    def _answer(self, request: Request) -> bytes | None:
+        """Return the answer, or None for silence (manual, 1.4.3)."""
+        if request.function == READ:
+            return self._read(request)
+        if request.function != WRITE:
+            return None
+        value = request.value
+        if value is None or request.register not in WRITABLE:
+            return None
+        accepted = self._write(request.register, value)
+        broadcast = request.device_id == BROADCAST
+        self.writes.append(
+            Write(request.t, request.register, value, accepted, broadcast)
+        )
+        self.refused += not accepted
+        self.step()
+        if broadcast:
+            return None
+        own_id = request.device_id
+        if not accepted:
+            return line(">", bytes((own_id, FAILURE, WRITE_FAILED)))
+        return line(">", bytes((own_id, WRITE)) + request.data[:4])
+
+    def _read(self, request: Request) -> bytes | None:
+        blocks = BLOCKS | EXTRA_BLOCKS if self.extra_registers else BLOCKS
+        quantity, content = blocks.get(request.register, (None, None))
+        if len(request.data) != 4 or request.quantity != quantity or not content:
+            return None
+        broadcast = request.device_id == BROADCAST
+        if broadcast and request.register not in BROADCAST_READS:
+            return None
+        number = request.register
+        if self.answer_register is not None:
+            number = self.answer_register
+        data = bytes((number,)) + content(self)
+        return line(">", bytes((self.device_id, READ, len(data))) + data)
+
+    def _write(self, register: int, value: int) -> bool:
+        if register == 0x14:
+            if not LOWEST_DUTY <= value <= NO_CURRENT:
+                return False
+            if not self.outlet.ignore_limit:
+                self.outlet.icmax = value
+            return True
+        if register == 0x2C:
+            return self._configure(value)
+        return self._modify_state(value)
+
+    def _configure(self, value: int) -> bool:
+        """Take a new ID and settings; they hold after the next reset."""
+        if self.outlet.state != "E2" or value & 0x0F00:
+            return False
+        if not 1 <= value & 0xFF <= LAST_ID:
+            return False
+        self._configuration = value
+        return True
+
+    def _modify_state(self, value: int) -> bool:
+        """Obey register 0x05 if the state allows it."""
+        if value == RESET:
+            # The answer is still sent; the reset begins after it.
+            self._schedule_reset()
+            return True
+        return self.outlet.obey(value)
+
+    def _schedule_reset(self) -> None:
+        if self.bus is None:
+            return
+        answer_time = self.turn_round + self.jitter + 20 * self.bus.byte_time
+        self.bus.loop.call_later(answer_time, self._reset)
+
+    def _reset(self) -> None:
+        self.resets += 1
+        if self.bus is None:
+            return
+        configuration, self._configuration = self._configuration, 0
+        if configuration:
+            self.device_id = configuration & 0xFF
+            upstream = configuration >> 14
+            if upstream in (FIELD_ON, FIELD_OFF):
+                self.outlet.upstream_enabled = upstream == FIELD_ON
+            enable = configuration >> 12 & 0b11
+            if enable in (FIELD_ON, FIELD_OFF):
+                self.outlet.b2_needs_enable_after_power = enable == FIELD_ON
+        self._finder = LineFinder()
+        self._deaf_until = self.bus.time() + self.boot_time
+        self.outlet.restart(self.now())

@@ -1,0 +1,274 @@
+"""The inside of a virtual ABL EVCC2/3: states, limits, meter. No wire.
+
+States and their meaning: manual, annex 3.4. What makes an outlet change its state is
+only partly in the manual; where it is silent, the README says what is assumed.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from .abl_frames import NO_CURRENT, amps_of, duty_of
+
+if TYPE_CHECKING:
+    from .car import Car
+
+CONNECTED = frozenset({"B1", "B2", "C2", "C3", "C4"})
+CHARGING = frozenset({"C2", "C3", "C4"})
+UNREADABLE = 0x3E8
+LOAD_IMBALANCE_DETECTION = 0x3838
+# The manual lets the meter loss cut to 10 A (annex 3.1, LCM); taken for BC3 to BC6.
+REDUCED_CURRENT = 10.0
+OVERCURRENT_STEPS = (
+    # Above this share of Ic: flag bits, seconds until F9 (register 0x06, bits 2..0).
+    (1.20, 0b111, 10.0),
+    (1.10, 0b011, 100.0),
+    (1.05, 0b101, 1000.0),
+    (1.005, 0b001, float("inf")),
+)
+
+
+class Outlet:
+    """One outlet. Times are the devices' times; plain attributes may be set anywhere.
+
+    - `en1`, `en2`: the inputs; `enable_input`: configuration bits 1..0 of register 0x02
+      (0 none, 1 must be closed for B1->B2, 2 closed = outlet enabled)
+    - `imbalance` BC3, `meter_failed` BC4, `hot` BC5, `upstream_lost` BC6
+    """
+
+    def __init__(
+        self,
+        car: Car | None = None,
+        *,
+        default_current: float = 16.0,
+        cable_current: float | None = None,
+        meter: bool = True,
+        upstream_enabled: bool = False,
+        upstream_timeout: float = 30.0,
+        enable_input: int = 0,
+    ) -> None:
+        """Make an outlet waiting for a car."""
+        self.car = car
+        self.default_current = default_current
+        self.cable_current = cable_current
+        self.default_duty: int | None = None
+        self.meter = meter
+        self.enable_input = enable_input
+        self.en1 = True
+        self.en2 = False
+        self.imbalance = self.meter_failed = self.hot = False
+        self.imbalance_detection = False
+        self.upstream_enabled = upstream_enabled
+        self.upstream_timeout = upstream_timeout
+        self.upstream_lost = False
+        # Register 0x06: bit 15 (F4 or F14), 14, 5, 4, 3.
+        self.timeout_triggers_f4 = True
+        self.b2_needs_enable_after_power = False
+        self.e0_a1_enabled = self.b1_b2_enabled = self.a1_b1_enabled = True
+        # How long B1 lasts, how long F4 lasts after polling began again.
+        self.b1_time = 0.2
+        self.f4_time = 1.0
+        # After so long at 100 % the outlet goes to E0 by itself, as seen on some.
+        self.e0_after_pause: float | None = None
+        self.ignore_limit = False
+        self.shows_c3 = False
+        self.icmax = self.default
+        self.state = "A1"
+        self._since = 0.0
+        self._last_contact = 0.0
+        self._recovers_at: float | None = None
+        self._paused_at: float | None = None
+        self._over = 0
+        self._over_since = 0.0
+
+    @property
+    def default(self) -> int:
+        """Return Idefault as a duty cycle."""
+        if self.default_duty is not None:
+            return self.default_duty
+        return duty_of(self.default_current)
+
+    @property
+    def ic(self) -> int:
+        """Return Ic as a duty cycle: the lowest of Icmax, Idefault, Ics (annex 3.3)."""
+        if self.icmax == NO_CURRENT:
+            return NO_CURRENT
+        candidates = [self.icmax, self.default]
+        if self.cable_current is not None:
+            candidates.append(duty_of(self.cable_current))
+        if self.reduced:
+            candidates.append(duty_of(REDUCED_CURRENT))
+        return min(candidates, key=amps_of)
+
+    @property
+    def ic_amps(self) -> float:
+        """Return what the car may draw per phase, in A."""
+        return amps_of(self.ic)
+
+    @property
+    def reduced(self) -> bool:
+        """Tell whether BC3 to BC6 reduce the duty cycle (only in B and C)."""
+        return self.state in CONNECTED and (
+            self.imbalance or self.meter_failed or self.hot or self.upstream_lost
+        )
+
+    @property
+    def ev_connected(self) -> bool:
+        """Tell whether U_CP is at most 10 V (not valid in states E and F)."""
+        return self.state in CONNECTED
+
+    @property
+    def phase_currents(self) -> tuple[float, float, float]:
+        """Return the real currents."""
+        return self.car.phase_currents if self.car else (0.0, 0.0, 0.0)
+
+    @property
+    def overcurrent(self) -> int:
+        """Return bits 2..0 of the flags."""
+        return self._over
+
+    # What happens at the outlet
+
+    def stop_locally(self) -> None:
+        """Disable the outlet, as by a key switch."""
+        self.en1 = False
+        self.go("E0")
+
+    def start_locally(self) -> None:
+        """Enable the outlet again."""
+        self.en1 = True
+        if self.state == "E0":
+            self.go("A1")
+
+    def fail(self, number: int) -> None:
+        """Go to one of the failures F1 to F11."""
+        self.go(f"F{number}")
+
+    def clear_failure(self) -> None:
+        """Leave a failure."""
+        if self.state.startswith("F"):
+            self.go("A1")
+
+    def set_by_somebody(self, amps: float) -> None:
+        """Let somebody else set Icmax (0 = no current allowed)."""
+        self.icmax = duty_of(amps)
+
+    def go(self, state: str) -> None:
+        """Change the state."""
+        if state != self.state:
+            self.state = state
+            self._since = self._now
+            self._recovers_at = None
+
+    def obey(self, value: int) -> bool:
+        """Obey a value of register 0x05 (not the reset); False if the state forbids."""
+        allowed = {
+            # E0 has no required state in the manual; out of a failure it would hide it.
+            0xE0E0: not self.state.startswith("F"),
+            0xF1F1: True,
+            0xA1A1: self.state == "E2" or (self.state == "E0" and self.e0_a1_enabled),
+            0xE2E2: self.state in ("A1", "E0"),
+            0x3838: self.state == "E2",
+        }.get(value, False)
+        if allowed and value == LOAD_IMBALANCE_DETECTION:
+            self.imbalance_detection = True
+        elif allowed:
+            self.go(f"{value >> 12 & 0xF:X}{value >> 8 & 0xF}")
+        return allowed
+
+    # Time
+
+    _now = 0.0
+
+    def restart(self, now: float) -> None:
+        """Start as after a power cycle: Icmax is Idefault again."""
+        self._now = now
+        self.icmax = self.default
+        self.upstream_lost = False
+        self._last_contact = now
+        self._over = 0
+        if self.b2_needs_enable_after_power and self.car and self.car.plugged:
+            self.b1_b2_enabled = False
+        self.go("A1")
+
+    def contact(self, now: float) -> None:
+        """Note that somebody upstream asked something."""
+        self._last_contact = now
+        self.upstream_lost = False
+        if self.state == "F4" and self._recovers_at is None:
+            self._recovers_at = now + self.f4_time
+
+    def step(self, now: float) -> None:
+        """Live until now."""
+        self._now = now
+        self._watch_upstream(now)
+        if self.enable_input == 2 and not self.en1 and self.state[0] in "ABC":
+            self.go("E0")
+        # From A1 to C2 there are three steps, all of which may be due.
+        for _ in range(3):
+            before = self.state
+            self._transition(now)
+            if before == self.state:
+                break
+        offered = self.ic_amps if self.state in CHARGING else None
+        if self.car is not None:
+            self.car.step(now, offered)
+        self._watch_current(now)
+        self._watch_pause(now)
+
+    def _watch_upstream(self, now: float) -> None:
+        if self._recovers_at is not None and now >= self._recovers_at:
+            self.go("A1")
+        if not self.upstream_enabled or self.state[0] not in "ABC":
+            return
+        if now - self._last_contact > self.upstream_timeout:
+            self.upstream_lost = True
+            if self.timeout_triggers_f4:
+                self.go("F4")
+
+    def _transition(self, now: float) -> None:
+        plugged = self.car is not None and self.car.plugged
+        state = self.state
+        if state in CONNECTED and not plugged:
+            self.go("A1")
+        elif state == "A1" and plugged and self.a1_b1_enabled:
+            self.go("B1")
+        elif state == "B1":
+            allowed = self.b1_b2_enabled and (self.enable_input != 1 or self.en1)
+            if allowed and now - self._since >= self.b1_time:
+                self.go("B2")
+        elif state in CONNECTED:
+            wants = self.car is not None and self.car.accepts(self.ic_amps)
+            self.go(self._charging_state() if wants else "B2")
+
+    def _charging_state(self) -> str:
+        if self.imbalance:
+            return "C4"
+        if self.hot or self.meter_failed or self.upstream_lost:
+            return "C3"
+        if self.shows_c3 and max(self.phase_currents) > 1.0:
+            return "C3"
+        return "C2"
+
+    def _watch_current(self, now: float) -> None:
+        allowed = self.ic_amps
+        over, patience = 0, float("inf")
+        if self.state in CHARGING and allowed:
+            share = max(self.phase_currents) / allowed
+            for threshold, bits, seconds in OVERCURRENT_STEPS:
+                if share > threshold:
+                    over, patience = bits, seconds
+                    break
+        if over != self._over:
+            self._over = over
+            self._over_since = now
+        elif over and now - self._over_since >= patience:
+            self.go("F9")
+
+    def _watch_pause(self, now: float) -> None:
+        if self.icmax != NO_CURRENT or self.e0_after_pause is None:
+            self._paused_at = None
+        elif self._paused_at is None:
+            self._paused_at = now
+        elif now - self._paused_at >= self.e0_after_pause and self.state[0] in "ABC":
+            self.go("E0")

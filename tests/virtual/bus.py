@@ -1,0 +1,378 @@
+"""The virtual bus: devices, wire, the client's port, and the thread they live on."""
+
+from __future__ import annotations
+
+import random
+from typing import TYPE_CHECKING
+
+from .faults import Faults
+from .log import CLIENT, INJECTED, NOISE, Entry, TrafficLog
+from .loop import LoopThread
+from .ports import Port, PtyPort, TcpPort
+from .wire import Wire
+
+if TYPE_CHECKING:
+    import asyncio
+    from collections.abc import Callable
+    from types import TracebackType
+    from typing import Self
+
+    from .device import Device
+    from .wire import Segment
+
+TICK = 0.05
+NO_PARITY_BITS = 10
+PARITY_BITS = 11
+
+
+class VirtualBus(LoopThread):
+    """An RS-485 bus with virtual devices on one end and a port on the other.
+
+    - `url`: what a client opens
+    - `log`: all traffic
+    - `faults`: what goes wrong on the whole bus
+    - `devices`: who is on it
+
+    Every method can be called from any thread.
+    """
+
+    def __init__(
+        self,
+        devices: tuple[Device, ...],
+        make_port: Callable[[VirtualBus], Port],
+        *,
+        baud: int | None = None,
+        parity: str | None = None,
+        time_scale: float = 1.0,
+        granularity: float = 0.002,
+        seed: int = 0,
+        ring: int | None = 20_000,
+    ) -> None:
+        """Prepare a bus; `start` or `with` brings it to life."""
+        super().__init__("virtual-bus")
+        lines = {(d.baud, d.parity) for d in devices} or {(38400, "N")}
+        if len(lines) > 1 and (baud is None or parity is None):
+            msg = "devices of different line settings on one bus: say baud and parity"
+            raise ValueError(msg)
+        line = next(iter(lines))
+        self.baud = baud or line[0]
+        self.parity = parity or line[1]
+        bits = NO_PARITY_BITS if self.parity == "N" else PARITY_BITS
+        self.byte_time = bits / self.baud
+        self.rng = random.Random(seed)  # noqa: S311 - repeatable on purpose
+        self.faults = Faults()
+        self.log = TrafficLog(ring)
+        self.devices: list[Device] = []
+        self.wire = Wire(self.byte_time, granularity, self.faults, self.rng)
+        self._make_port = make_port
+        self._port: Port | None = None
+        self._url = ""
+        self._plugged = False
+        self._ticker: asyncio.TimerHandle | None = None
+        self._foreign: list[asyncio.TimerHandle] = []
+        self._scale = time_scale
+        self._device_time = 0.0
+        self._real_time = 0.0
+        for device in devices:
+            self._add(device)
+
+    @classmethod
+    def pty(
+        cls,
+        *devices: Device,
+        link: str | None = None,
+        **options: float | str | None,
+    ) -> VirtualBus:
+        """Make a bus on a pseudo-terminal; `link` is its stable path."""
+
+        def make(bus: VirtualBus) -> Port:
+            return PtyPort(bus.loop, bus.wire.send_client, link)
+
+        return cls(devices, make, **options)  # type: ignore[arg-type]
+
+    @classmethod
+    def tcp(
+        cls, *devices: Device, port: int = 0, **options: float | str | None
+    ) -> VirtualBus:
+        """Make a bus on a TCP socket of this machine."""
+
+        def make(bus: VirtualBus) -> Port:
+            return TcpPort(bus.loop, bus.wire.send_client, port)
+
+        return cls(devices, make, **options)  # type: ignore[arg-type]
+
+    # Life
+
+    def start(self) -> Self:
+        """Start the thread and make the port appear."""
+        self.start_thread()
+        try:
+            self.call(self._start)
+        except BaseException:
+            self.stop_thread()
+            raise
+        return self
+
+    def stop(self) -> None:
+        """Take the port away and end the thread; raise what went wrong inside."""
+        if self.running:
+            self.call(self._stop)
+            self.stop_thread()
+        if self.errors:
+            msg = "an error inside the virtual bus"
+            raise RuntimeError(msg) from self.errors[0]
+
+    def __enter__(self) -> Self:
+        """Start."""
+        return self.start()
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Stop."""
+        self.stop()
+
+    async def __aenter__(self) -> Self:
+        """Start; it takes some milliseconds."""
+        return self.start()
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Stop; it takes some milliseconds."""
+        self.stop()
+
+    # The client's end
+
+    @property
+    def url(self) -> str:
+        """Return what a client opens: a path or a URL, the same after a replug."""
+        return self._url
+
+    @property
+    def connected(self) -> bool:
+        """Tell whether a client has the port open."""
+        return self._port is not None and self._port.connected
+
+    @property
+    def opened(self) -> int:
+        """Return how often a client has opened the port."""
+        return self._port.opened if self._port is not None else 0
+
+    def unplug(self) -> None:
+        """Pull the adapter: the client loses the port, the path disappears."""
+        self.call(self._unplug)
+
+    def replug(self) -> None:
+        """Put the adapter back, behind the same path or port number."""
+        self.call(self._replug)
+
+    # Time
+
+    def time(self) -> float:
+        """Return the real time of the wire, in seconds."""
+        return self.loop.time()
+
+    def now(self) -> float:
+        """Return the devices' time: real time times `time_scale`."""
+        if not self.running:
+            return self._device_time
+        return self._device_time + (self.time() - self._real_time) * self._scale
+
+    @property
+    def time_scale(self) -> float:
+        """Return how much faster than real the devices' time runs."""
+        return self._scale
+
+    @time_scale.setter
+    def time_scale(self, scale: float) -> None:
+        """Change the pace of the devices' time (never that of the wire)."""
+
+        def change() -> None:
+            self._device_time = self.now()
+            self._real_time = self.time()
+            self._scale = scale
+
+        self.call(change)
+
+    def advance(self, seconds: float) -> None:
+        """Let that much of the devices' time pass at once."""
+
+        def jump() -> None:
+            self._device_time += seconds
+            self._step_devices()
+
+        self.call(jump)
+
+    # Who is on the bus, and what else
+
+    def add(self, device: Device) -> None:
+        """Connect one more device."""
+        self.call(lambda: self._add(device))
+
+    def remove(self, device: Device) -> None:
+        """Disconnect a device."""
+
+        def remove() -> None:
+            self.devices.remove(device)
+            device.bus = None
+
+        self.call(remove)
+
+    def inject(
+        self, data: bytes, *, after: float = 0.0, source: str = INJECTED
+    ) -> None:
+        """Put somebody else's bytes on the wire, `after` seconds from now."""
+        self.call(lambda: self.wire.send(source, data, self.time() + after))
+
+    def foreign_traffic(
+        self, data: bytes, every: float, *, polite: float = 0.0
+    ) -> None:
+        """Let another master send `data` periodically, until `quiet`.
+
+        With `polite` it waits for that much silence first, else it just talks.
+        """
+
+        def talk(index: int) -> None:
+            self._foreign[index] = self.loop.call_later(every, talk, index)
+            start = self.time()
+            if polite and start - self.wire.idle_from < polite:
+                return
+            self.wire.send(INJECTED, data, start)
+
+        def begin() -> None:
+            index = len(self._foreign)
+            self._foreign.append(self.loop.call_later(every, talk, index))
+
+        self.call(begin)
+
+    def quiet(self) -> None:
+        """End all other masters' traffic."""
+
+        def end() -> None:
+            for timer in self._foreign:
+                timer.cancel()
+
+        self.call(end)
+
+    def stats(self) -> dict[str, object]:
+        """Return the counters of the bus and its devices."""
+
+        def collect() -> dict[str, object]:
+            return {
+                "url": self.url,
+                "opened": self.opened,
+                "transmissions": self.log.total,
+                "bytes": self.wire.bytes_carried,
+                "collisions": self.wire.collisions,
+                "overruns": self._port.overruns if self._port else 0,
+                "faults": dict(self.faults.happened),
+                "devices": {d.name: d.stats() for d in self.devices},
+            }
+
+        return self.call(collect)
+
+    # For devices, on the bus thread
+
+    def send_at(self, device: Device, data: bytes, at: float) -> None:
+        """Send at that time, whatever else is on the wire."""
+        if at <= self.time():
+            self.wire.send(device.name, data, self.time())
+            return
+        self.loop.call_at(at, self._send_due, device, data)
+
+    def send_after_silence(
+        self, device: Device, data: bytes, at: float, silence: float
+    ) -> None:
+        """Send at that time or later, as soon as the wire was silent so long."""
+        free_at = self.wire.idle_from + silence
+        now = self.time()
+        if max(at, free_at) <= now:
+            self._send_due(device, data)
+            return
+        self.loop.call_at(
+            max(at, free_at), self.send_after_silence, device, data, at, silence
+        )
+
+    # Inside
+
+    def _add(self, device: Device) -> None:
+        names = {d.name for d in self.devices}
+        name, number = device.name, 1
+        while device.name in names:
+            number += 1
+            device.name = f"{name}#{number}"
+        device.bus = self
+        self.devices.append(device)
+
+    def _start(self) -> None:
+        self._real_time = self.time()
+        self.wire.attach(self.loop, self._to_client, self._to_devices, self._logged)
+        self._port = self._make_port(self)
+        self._replug()
+        self._url = self._port.url
+        self._tick()
+
+    def _stop(self) -> None:
+        self._device_time = self.now()
+        if self._ticker is not None:
+            self._ticker.cancel()
+        for timer in self._foreign:
+            timer.cancel()
+        self.wire.drop_pending()
+        if self._port is not None:
+            self._port.close()
+
+    def _unplug(self) -> None:
+        if self._port is not None:
+            self._port.unplug()
+        self._plugged = False
+
+    def _replug(self) -> None:
+        if self._port is not None:
+            self._port.plug()
+        self._plugged = True
+
+    def _tick(self) -> None:
+        self._ticker = self.loop.call_later(TICK, self._tick)
+        self._step_devices()
+        rate = self.faults.noise_rate
+        if rate and self.rng.random() < rate * TICK:
+            after = self.rng.random() * TICK
+            data = bytes((self.rng.randrange(256),))
+            self.wire.send(NOISE, data, self.time() + after)
+        self.check_waiters()
+
+    def _step_devices(self) -> None:
+        for device in self.devices:
+            device.step()
+
+    def _send_due(self, device: Device, data: bytes) -> None:
+        if device.bus is self:
+            self.wire.send(device.name, data, self.time())
+
+    def _to_client(self, data: bytes) -> None:
+        if self._port is not None:
+            self._port.write(data)
+
+    def _to_devices(self, segments: list[Segment]) -> None:
+        for segment in segments:
+            if segment.sources == (CLIENT,) and not self._plugged:
+                continue
+            for device in tuple(self.devices):
+                if device.name in segment.sources or device.faults.dead:
+                    continue
+                if not self.faults.dead:
+                    device.hear(segment)
+        self.check_waiters()
+
+    def _logged(self, entry: Entry) -> None:
+        self.log.add(entry)
+        if entry.source != CLIENT and self._port is not None:
+            self._port.after_reply()

@@ -1,0 +1,207 @@
+"""The shell's way to virtual chargers: `scripts/virtual-chargers`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+import signal
+import sys
+import threading
+import time
+from typing import TYPE_CHECKING
+
+from .abl import AblBox
+from .bus import VirtualBus
+from .car import Car, CarLife
+from .control import HELP, Control, describe
+from .evbox import EvboxChargePoint, Module
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from .device import Device
+
+STATUS_INTERVAL = 5.0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run until SIGTERM, SIGINT, or the end of --duration."""
+    options = _parser().parse_args(arguments)
+    devices = _abl(options) if options.protocol == "abl" else _evbox(options)
+    for device in devices:
+        if _number(device) in options.dead:
+            device.faults.dead = True
+    settings = {
+        "baud": options.baud,
+        "parity": options.parity,
+        "time_scale": options.time_scale,
+        "granularity": options.granularity,
+        "seed": options.seed,
+    }
+    if options.tcp is not None:
+        bus = VirtualBus.tcp(*devices, port=options.tcp, **settings)
+    else:
+        bus = VirtualBus.pty(*devices, link=options.pty or None, **settings)
+    bus.faults.byte_error_rate = options.error_rate
+    bus.faults.lose_rate = options.lose_rate
+    bus.faults.late_rate = options.late_rate
+    bus.faults.late_by = options.late_by
+    bus.faults.noise_rate = options.noise_rate
+    bus.faults.echo = options.echo
+    over = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: over.set())
+    with bus:
+        _say(f"ready {options.protocol} {bus.url}")
+        if options.control:
+            control = Control(bus, _say)
+            threading.Thread(
+                target=_read_commands, args=(control,), daemon=True
+            ).start()
+        _run(bus, options, over)
+        if options.stats:
+            text = json.dumps(bus.stats(), indent=2) + "\n"
+            Path(options.stats).write_text(text, encoding="utf-8")
+    return 0
+
+
+def _run(bus: VirtualBus, options: argparse.Namespace, over: threading.Event) -> None:
+    end = time.monotonic() + options.duration if options.duration else float("inf")
+    while not over.is_set():
+        left = end - time.monotonic()
+        if left <= 0:
+            return
+        over.wait(min(left, STATUS_INTERVAL))
+        if options.verbose and not over.is_set():
+            _say(bus.call(lambda: describe(bus)))
+
+
+def _read_commands(control: Control) -> None:
+    for text in sys.stdin:
+        control.do(text)
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+def _number(device: Device) -> int:
+    if isinstance(device, AblBox):
+        return device.device_id
+    return int(device.serial) if isinstance(device, EvboxChargePoint) else 0
+
+
+def _car(options: argparse.Namespace, index: int) -> Car:
+    """Make the car of one connector; each has its own dice and habits."""
+    life = CarLife(seed=options.seed * 1000 + index)
+    car = Car(
+        max_current=(16.0, 32.0, 20.0)[index % 3],
+        phases=(3, 3, 1)[index % 3],
+        life=life if options.cars == "auto" else None,
+    )
+    if options.cars == "plugged":
+        car.plug_in()
+    return car
+
+
+def _abl(options: argparse.Namespace) -> list[Device]:
+    boxes: list[Device] = []
+    for index, device_id in enumerate(options.ids):
+        box = AblBox(
+            device_id,
+            car=_car(options, index),
+            serial=f"2W22xy{1234567 + index:08d}",
+            default_current=options.default_current,
+            meter=not options.no_meter,
+            upstream_enabled=options.upstream_timeout is not None,
+            upstream_timeout=options.upstream_timeout or 30.0,
+            sleep_after=options.sleep,
+            extra_registers=options.extra_registers,
+            turn_round=options.turn_round,
+        )
+        box.l3_first = options.l3_first
+        boxes.append(box)
+    return boxes
+
+
+def _evbox(options: argparse.Namespace) -> list[Device]:
+    points: list[Device] = []
+    numbers = options.modules
+    for index, serial in enumerate(options.serials):
+        count = numbers[min(index, len(numbers) - 1)]
+        modules = [
+            Module(
+                car=_car(options, index * 20 + number),
+                min_current=options.min_current,
+                energy_wh=1000.0 * (index * 20 + number + 1),
+            )
+            for number in range(count)
+        ]
+        points.append(
+            EvboxChargePoint(
+                serial,
+                modules,
+                max_current=options.max_current,
+                min_interval=options.min_interval,
+                commands=set(options.commands),
+            )
+        )
+    return points
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="virtual-chargers",
+        description="Virtual chargers on a virtual RS-485 bus, at the line's real pace."
+        " Prints `ready <protocol> <url>` when a client may open it.",
+    )
+    kinds = parser.add_subparsers(dest="protocol", required=True)
+    abl = kinds.add_parser("abl", help="ABL EVCC2/3 boxes")
+    _common(abl.add_argument)
+    add = abl.add_argument
+    add("--ids", type=int, nargs="+", default=[1], help="device-IDs; twice = two boxes")
+    add("--no-meter", action="store_true", help="no phase-current meter")
+    add("--default-current", type=float, default=16.0, metavar="A")
+    add("--sleep", type=float, metavar="S", help="sleep after S seconds of silence")
+    add("--upstream-timeout", type=float, metavar="S", help="F4 when nobody polls")
+    add("--extra-registers", action="store_true", help="answer 0x04 and 0x0F too")
+    add("--turn-round", type=float, default=0.002, metavar="S")
+    add("--l3-first", action="store_true", help="phase order L3, L2, L1")
+    evbox = kinds.add_parser("evbox", help="EVBox ChargePoints (Protocol Max v4)")
+    _common(evbox.add_argument)
+    add = evbox.add_argument
+    add("--serials", type=int, nargs="+", default=[1923054])
+    add("--modules", type=int, nargs="+", default=[1], help="a number a ChargePoint")
+    add("--max-current", type=float, default=35.0, metavar="A")
+    add("--min-current", type=float, default=6.0, metavar="A")
+    add("--min-interval", type=int, default=1, metavar="S")
+    add("--commands", type=int, nargs="+", default=[68, 69], choices=[68, 69])
+    return parser
+
+
+def _common(add: Callable[..., object]) -> None:
+    add("--tcp", type=int, metavar="PORT", help="a TCP port of this machine; 0 = any")
+    add(
+        "--pty", nargs="?", const="", metavar="LINK", help="a pseudo-terminal (default)"
+    )
+    add("--baud", type=int)
+    add("--parity", choices=["N", "E", "O"])
+    add("--cars", choices=["auto", "plugged", "none"], default="none")
+    add(
+        "--time-scale", type=float, default=1.0, help="cars and time-outs, not the wire"
+    )
+    add("--granularity", type=float, default=0.002, help="seconds a chunk of a reply")
+    add("--seed", type=int, default=0)
+    add("--dead", type=int, nargs="+", default=[], help="IDs or serials that are dead")
+    add("--error-rate", type=float, default=0.0, help="a byte's chance to be damaged")
+    add("--lose-rate", type=float, default=0.0, help="a reply's chance to be lost")
+    add("--late-rate", type=float, default=0.0, help="a reply's chance to be late")
+    add("--late-by", type=float, default=0.5, metavar="S")
+    add("--noise-rate", type=float, default=0.0, help="noise bytes per second")
+    add("--echo", action="store_true", help="the adapter echoes what it sends")
+    add("--control", action="store_true", help=f"read commands from stdin: {HELP}")
+    add("--duration", type=float, metavar="S", help="end after S seconds")
+    add("--stats", metavar="FILE", help="write the counters as JSON at the end")
+    add("--verbose", action="store_true", help="print the state every 5 s")

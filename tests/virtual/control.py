@@ -1,0 +1,130 @@
+"""Commands in words, for the demo and other processes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from .abl import AblBox
+from .evbox import EvboxChargePoint
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from .bus import VirtualBus
+    from .car import Car
+    from .device import Device
+
+HELP = (
+    "plug|request|finish|leave ID[.MODULE]; dead|alive|power-cycle ID;"
+    " fail ID N; clear ID; stop|start ID; others ID A;"
+    " unplug-adapter; replug-adapter; advance S; status"
+)
+
+
+class Control:
+    """Does what a line of text says; answers `ok`, a status, or `error ...`."""
+
+    def __init__(self, bus: VirtualBus, say: Callable[[str], None]) -> None:
+        """Control that bus; answers go to `say`."""
+        self._bus = bus
+        self._say = say
+
+    def do(self, text: str) -> None:
+        """Do one line."""
+        words = text.split()
+        if not words:
+            return
+        try:
+            self._say(self._do(words[0], words[1:]))
+        except (IndexError, KeyError, TypeError, ValueError) as error:
+            self._say(f"error {text.strip()}: {error}")
+
+    def _do(self, word: str, values: list[str]) -> str:
+        bus = self._bus
+        if word == "status":
+            return bus.call(lambda: describe(bus))
+        if word in ("unplug-adapter", "replug-adapter"):
+            (bus.unplug if word == "unplug-adapter" else bus.replug)()
+        elif word == "advance":
+            bus.advance(float(values[0]))
+        elif word in ("plug", "request", "finish", "leave"):
+            car = self._car(values[0])
+            {
+                "plug": car.plug_in,
+                "request": car.request,
+                "finish": car.finish,
+                "leave": car.leave,
+            }[word]()
+        else:
+            self._device_command(word, self._device(values[0]), values[1:])
+        return "ok"
+
+    def _device_command(self, word: str, device: Device, values: list[str]) -> None:
+        if word in ("dead", "alive"):
+            device.faults.dead = word == "dead"
+        elif word == "power-cycle" and isinstance(device, AblBox | EvboxChargePoint):
+            device.power_cycle()
+        elif not isinstance(device, AblBox):
+            msg = f"{word} is nothing for {device.name}"
+            raise TypeError(msg)
+        elif word == "fail":
+            device.fail(int(values[0]))
+        elif word == "clear":
+            device.clear_failure()
+        elif word == "stop":
+            device.stop_locally()
+        elif word == "start":
+            device.start_locally()
+        elif word == "others":
+            device.set_by_somebody(float(values[0]))
+        else:
+            msg = f"no such command; there are: {HELP}"
+            raise ValueError(msg)
+
+    def _device(self, key: str) -> Device:
+        for device in self._bus.devices:
+            if isinstance(device, AblBox) and device.device_id == int(key):
+                return device
+            if isinstance(device, EvboxChargePoint) and int(device.serial) == int(key):
+                return device
+        msg = f"no charger {key}"
+        raise KeyError(msg)
+
+    def _car(self, key: str) -> Car:
+        number, _, module = key.partition(".")
+        device = self._device(number)
+        car = None
+        if isinstance(device, AblBox):
+            car = device.outlet.car
+        elif isinstance(device, EvboxChargePoint):
+            car = device.modules[int(module or 1) - 1].car
+        if car is None:
+            msg = f"no car at {key}"
+            raise KeyError(msg)
+        return car
+
+
+def describe(bus: VirtualBus) -> str:
+    """Return the state of all chargers, a line each (on the bus thread)."""
+    client = "connected" if bus.connected else "away"
+    traffic = f"{bus.log.total} transmissions, {bus.wire.collisions} collisions"
+    lines = [f"{bus.url}: client {client}, {traffic}"]
+    for device in bus.devices:
+        dead = " (dead)" if device.faults.dead else ""
+        if isinstance(device, AblBox):
+            currents = "/".join(f"{c:.1f}" for c in device.outlet.phase_currents)
+            lines.append(
+                f"  {device.name}{dead}: {device.state}, may {device.ic_amps:.1f} A,"
+                f" draws {currents} A, {device.requests} requests"
+            )
+        elif isinstance(device, EvboxChargePoint):
+            limits = "/".join(f"{c:.1f}" for c in device.limits_in_force)
+            back = " (failed back)" if device.failed_back else ""
+            draws = ", ".join(
+                "/".join(f"{c:.1f}" for c in m.measured()[0]) for m in device.modules
+            )
+            lines.append(
+                f"  {device.name}{dead}: limits {limits} A{back}, draws {draws},"
+                f" {device.counters.accepted} orders"
+            )
+    return "\n".join(lines)

@@ -1,0 +1,358 @@
+"""A virtual EVBox ChargePoint (Protocol Max v4), written from the manual."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, ClassVar
+
+from .device import Device, on_bus_thread
+from .evbox_frames import (
+    CHARGEPOINT,
+    SMARTGRID,
+    FrameFinder,
+    Heard,
+    Order,
+    checked,
+    frame,
+    order,
+    word,
+)
+from .log import CLIENT
+
+if TYPE_CHECKING:
+    from .car import Car
+    from .wire import Segment
+
+MAX_MODULES = 20
+SILENCE = 0.1
+# Timers of a computer and of a box are not the same: nobody is blamed for this much.
+SILENCE_TOLERANCE = 0.001
+INTERVAL_TOLERANCE = 0.05
+IDLE_COS_PHI = 1.0
+ANY_SERIAL = "00000000"
+Three = tuple[float, float, float]
+
+
+@dataclass
+class Module:
+    """One ChargeBox module: a connector with its own meter and perhaps a car."""
+
+    car: Car | None = None
+    min_current: float = 6.0
+    energy_wh: float = 0.0
+    voltages: Three = (230.0, 230.0, 230.0)
+    # What the reply says instead of the truth, for old captures and for lies.
+    currents: Three | None = None
+    cos_phis: Three | None = None
+    offered: float = 0.0
+
+    def measured(self) -> tuple[Three, Three]:
+        """Return currents and cos phi of the three phases."""
+        currents = self.car.phase_currents if self.car else (0.0, 0.0, 0.0)
+        phi = self.car.cos_phi if self.car else IDLE_COS_PHI
+        one, two, three = (phi if i else IDLE_COS_PHI for i in currents)
+        return self.currents or currents, self.cos_phis or (one, two, three)
+
+
+@dataclass
+class Lie:
+    """An implausible answer, with a valid checksum."""
+
+    module: int
+    times: int | None
+    current: Three | None = None
+    cos_phi: Three | None = None
+    voltage: Three | None = None
+    energy_jump: float = 0.0
+
+
+@dataclass
+class Counters:
+    """What happened to requests."""
+
+    accepted: int = 0
+    too_soon: int = 0
+    bad_checksum: int = 0
+    malformed: int = 0
+    for_others: int = 0
+    over_limit_requests: int = 0
+    zero_timeouts: int = 0
+    silence_violations: int = 0
+    fail_backs: int = 0
+
+
+@dataclass
+class _Standing:
+    """The order in force, and when it came."""
+
+    limits: Three
+    fallback: Three
+    timeout: float
+    since: float
+    heard_at: float = field(default=float("-inf"))
+
+
+class EvboxChargePoint(Device):
+    """A ChargePoint with up to 20 modules, which share its limit.
+
+    - `orders`: every accepted order; `limits_in_force`, `failed_back`: what is in force
+    - `counters`: what was refused or wrong
+    - `serial` can be set: another ChargePoint in its place
+    - `min_interval` (s) is told in the reply and enforced in real time
+    """
+
+    protocol: ClassVar[str] = "evbox"
+    silence_rule: ClassVar[float] = SILENCE
+
+    def __init__(
+        self,
+        serial: int | str = 1923054,
+        modules: int | list[Module] = 1,
+        *,
+        max_current: float = 35.0,
+        min_interval: int = 1,
+        commands: frozenset[int] | set[int] = frozenset({68, 69}),
+        turn_round: float = 0.0,
+        jitter: float = 0.002,
+        name: str = "",
+    ) -> None:
+        """Make a ChargePoint; its limits are its maximum until an order comes."""
+        self.serial = f"{int(serial):08d}"
+        super().__init__(name or f"evbox-{int(serial)}")
+        if isinstance(modules, int):
+            modules = [Module() for _ in range(modules)]
+        self.modules = modules
+        self.max_current = max_current
+        self.min_interval = min_interval
+        self.commands = set(commands)
+        self.turn_round = turn_round
+        self.jitter = jitter
+        self.counters = Counters()
+        self.orders: list[Order] = []
+        self.failed_back = False
+        self._finder = FrameFinder()
+        self._standing: _Standing | None = None
+        self._lies: list[Lie] = []
+
+    # What a test looks at, or does
+
+    @property
+    def limits_in_force(self) -> Three:
+        """Return the limits that hold now, A per phase, never above the maximum.
+
+        "Initially the maximum currents are equal to the maximum rating of the
+        connection" (command 68, note **).
+        """
+        standing = self._standing
+        if standing is None:
+            return (self.max_current,) * 3
+        return self._capped(standing.fallback if self.failed_back else standing.limits)
+
+    @property
+    def silence_violations(self) -> int:
+        """Return how many requests to it came without the silence before them."""
+        return self.counters.silence_violations
+
+    @property
+    def over_limit_requests(self) -> int:
+        """Return how many orders asked for more than the connection has."""
+        return self.counters.over_limit_requests
+
+    def lie(
+        self,
+        module: int = 0,
+        *,
+        times: int | None = 1,
+        current: float | None = None,
+        cos_phi: float | None = None,
+        voltage: float | None = None,
+        energy_jump: float = 0.0,
+    ) -> None:
+        """Answer the next `times` requests (None: all) implausibly.
+
+        The energy jump is added to the meter told, not to the meter.
+        """
+        self._lies.append(
+            Lie(
+                module,
+                times,
+                _three(current),
+                _three(cos_phi),
+                _three(voltage),
+                energy_jump,
+            )
+        )
+
+    def honest(self) -> None:
+        """End all lies."""
+        self._lies.clear()
+
+    @on_bus_thread
+    def add_module(
+        self, module: Module | None = None, index: int | None = None
+    ) -> None:
+        """Add a module, at the end or at an index."""
+        if len(self.modules) >= MAX_MODULES:
+            msg = f"a ChargePoint has at most {MAX_MODULES} modules"
+            raise ValueError(msg)
+        self.modules.insert(
+            len(self.modules) if index is None else index, module or Module()
+        )
+
+    @on_bus_thread
+    def remove_module(self, index: int = -1) -> Module:
+        """Take a module away; those behind it move up."""
+        return self.modules.pop(index)
+
+    @on_bus_thread
+    def power_cycle(self) -> None:
+        """Lose everything that was ordered."""
+        self._standing = None
+        self.failed_back = False
+
+    def stats(self) -> dict[str, object]:
+        """Return the counters."""
+        return {**super().stats(), **vars(self.counters)}
+
+    # On the bus
+
+    def hear(self, segment: Segment) -> None:
+        """Hear bytes; answer a request that is meant for us."""
+        for heard in self._finder.feed(segment):
+            self._heard(heard)
+
+    def step(self) -> None:
+        """Time out, share the limit among the modules, let the cars draw."""
+        now = self.now()
+        standing = self._standing
+        if (
+            standing is not None
+            and not self.failed_back
+            and now - standing.since >= standing.timeout
+        ):
+            self._step_modules(standing.since + standing.timeout)
+            self.failed_back = True
+            self.counters.fail_backs += 1
+        self._step_modules(now)
+
+    def _heard(self, heard: Heard) -> None:
+        body = checked(heard.text)
+        if body is None:
+            if heard.source == CLIENT:
+                self.counters.bad_checksum += 1
+            return
+        if body[:2] != CHARGEPOINT:
+            self.counters.for_others += 1
+            return
+        request = order(body, heard.end)
+        if request is None:
+            self.counters.malformed += 1
+            return
+        if request.command not in self.commands:
+            return
+        if request.serial not in (None, self.serial, ANY_SERIAL):
+            self.counters.for_others += 1
+            return
+        self.requests += 1
+        if heard.silence < SILENCE - SILENCE_TOLERANCE and heard.source == CLIENT:
+            self.counters.silence_violations += 1
+        last = self._standing.heard_at if self._standing else float("-inf")
+        if heard.end - last < self.min_interval - INTERVAL_TOLERANCE:
+            self.counters.too_soon += 1
+            return
+        self._accept(request)
+
+    def _accept(self, request: Order) -> None:
+        self.step()
+        self.counters.accepted += 1
+        self.orders.append(request)
+        if max(request.limits + request.fallback) > self.max_current:
+            self.counters.over_limit_requests += 1
+        if not request.timeout:
+            self.counters.zero_timeouts += 1
+        self._standing = _Standing(
+            request.limits,
+            request.fallback,
+            float(request.timeout),
+            self.now(),
+            request.t,
+        )
+        self.failed_back = False
+        self.step()
+        jitter = self.bus.rng.random() * self.jitter if self.bus else 0.0
+        # The silence is counted from the request's end, so that is the least wait.
+        self.send(frame(self._reply(request)), self.turn_round, SILENCE + jitter)
+
+    def _reply(self, request: Order) -> str:
+        parts = [SMARTGRID, CHARGEPOINT, f"{request.command:02d}"]
+        long = request.command == 68
+        if long:
+            parts.append(self.serial)
+        parts += [word(self.min_interval), word(self.max_current * 10)]
+        parts.append(f"{len(self.modules):02X}")
+        for index, module in enumerate(self.modules):
+            currents, cos_phis = module.measured()
+            energy, voltages = module.energy_wh, module.voltages
+            for lie in self._lies:
+                if lie.module == index:
+                    currents = lie.current or currents
+                    cos_phis = lie.cos_phi or cos_phis
+                    voltages = lie.voltage or voltages
+                    energy += lie.energy_jump
+            parts.append(word(module.min_current * 10))
+            parts += [word(current * 10) for current in currents]
+            parts += [word(phi * 1000) for phi in cos_phis]
+            parts.append(f"{int(energy) & 0xFFFFFFFF:08X}")
+            if long:
+                parts += [word(voltage) for voltage in voltages]
+        for lie in tuple(self._lies):
+            if lie.times is not None:
+                lie.times -= 1
+                if lie.times <= 0:
+                    self._lies.remove(lie)
+        return "".join(parts)
+
+    def _step_modules(self, now: float) -> None:
+        self._share()
+        for module in self.modules:
+            if module.car is not None:
+                module.energy_wh += module.car.step(
+                    now, module.offered, module.voltages[0]
+                )
+
+    def _share(self) -> None:
+        """Share the limit: equal parts, and none below a module's minimum.
+
+        Which module goes without, when there is not enough for all, is not in the
+        manual: here the last one.
+        """
+        limits = self.limits_in_force
+        asking = []
+        for module in self.modules:
+            module.offered = 0.0
+            if module.car is not None and module.car.accepts(self.max_current):
+                asking.append((module, module.car.uses))
+        while asking:
+            users = [0, 0, 0]
+            for _, uses in asking:
+                for phase in uses:
+                    users[phase] += 1
+            shares = [min(limits[p] / users[p] for p in uses) for _, uses in asking]
+            starved = [
+                index
+                for index, share in enumerate(shares)
+                if share < asking[index][0].min_current
+            ]
+            if not starved:
+                for (module, _), share in zip(asking, shares, strict=True):
+                    module.offered = share
+                return
+            del asking[starved[-1]]
+
+    def _capped(self, limits: Three) -> Three:
+        one, two, three = (min(limit, self.max_current) for limit in limits)
+        return one, two, three
+
+
+def _three(value: float | None) -> Three | None:
+    return None if value is None else (value,) * 3

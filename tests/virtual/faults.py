@@ -1,0 +1,119 @@
+"""What can go wrong on a wire, by rates or just once."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from random import Random
+
+Kind = Literal["lose", "late", "duplicate", "truncate", "corrupt", "replace", "noise"]
+
+
+@dataclass(slots=True)
+class Faults:
+    """Faults of one device, or of the whole bus (`bus.faults`).
+
+    Rates are probabilities per reply, `byte_error_rate` per byte. All can be set at
+    any time from any thread. `echo` and `noise_rate` (bytes per second) have a meaning
+    only on the bus; `dead` on the bus is a cut cable: nothing reaches any device.
+    """
+
+    byte_error_rate: float = 0.0
+    lose_rate: float = 0.0
+    late_rate: float = 0.0
+    late_by: float = 0.5
+    duplicate_rate: float = 0.0
+    truncate_rate: float = 0.0
+    dead: bool = False
+    echo: bool = False
+    noise_rate: float = 0.0
+    happened: dict[str, int] = field(default_factory=dict)
+    _once: deque[tuple[Kind, object]] = field(default_factory=deque)
+
+    def once(self, kind: Kind, value: float | bytes | None = None) -> None:
+        """Let the next reply suffer; several calls are for several replies in turn.
+
+        - `lose`: it is never sent
+        - `late`: sent `value` seconds later (default `late_by`)
+        - `duplicate`: sent twice
+        - `truncate`: cut to its first `value` bytes (default half)
+        - `corrupt`: one bit of byte `value` flips (default the middle one)
+        - `replace`: the bytes `value` are sent in its place
+        - `noise`: the bytes `value` are sent just before it
+        """
+        self._once.append((kind, value))
+
+    def clear(self) -> None:
+        """Take all faults away, also those waiting; the counters stay."""
+        self.byte_error_rate = self.lose_rate = self.late_rate = 0.0
+        self.duplicate_rate = self.truncate_rate = self.noise_rate = 0.0
+        self.dead = self.echo = False
+        self._once.clear()
+
+    def apply(
+        self, replies: list[tuple[float, bytes]], rng: Random
+    ) -> list[tuple[float, bytes]]:
+        """Return what becomes of the replies: (delay in seconds, bytes) pairs."""
+        if self.dead:
+            self._count("dead")
+            return []
+        if self._once and replies:
+            kind, value = self._once.popleft()
+            replies = self._do(kind, value, replies, rng)
+        for kind, rate in (
+            ("lose", self.lose_rate),
+            ("late", self.late_rate),
+            ("duplicate", self.duplicate_rate),
+            ("truncate", self.truncate_rate),
+        ):
+            if rate and replies and rng.random() < rate:
+                replies = self._do(kind, None, replies, rng)  # type: ignore[arg-type]
+        return replies
+
+    def disturb(self, data: bytes, rng: Random) -> bytes:
+        """Flip bits at the byte error rate."""
+        rate = self.byte_error_rate
+        if not rate or rng.random() >= 1 - (1 - rate) ** len(data):
+            return data
+        # At least one byte is hit; the others keep their own chance.
+        hit = rng.randrange(len(data))
+        damaged = bytearray(data)
+        for index in range(len(damaged)):
+            if index == hit or rng.random() < rate:
+                damaged[index] ^= 1 << rng.randrange(8)
+                self._count("byte_error")
+        return bytes(damaged)
+
+    def _do(
+        self,
+        kind: Kind,
+        value: object,
+        replies: list[tuple[float, bytes]],
+        rng: Random,
+    ) -> list[tuple[float, bytes]]:
+        self._count(kind)
+        delay, data = replies[0]
+        rest = replies[1:]
+        number = value if isinstance(value, (int, float)) else None
+        first: list[tuple[float, bytes]] = []
+        if kind == "late":
+            first = [(delay + (self.late_by if number is None else number), data)]
+        elif kind == "duplicate":
+            first = [(delay, data), (delay, data)]
+        elif kind == "truncate":
+            first = [(delay, data[: len(data) // 2 if number is None else int(number)])]
+        elif kind == "corrupt":
+            index = len(data) // 2 if number is None else int(number)
+            damaged = bytearray(data)
+            damaged[index] ^= 1 << rng.randrange(7)
+            first = [(delay, bytes(damaged))]
+        elif kind != "lose":
+            other = value if isinstance(value, bytes) else b"\x00\xff"
+            first = [(delay, other if kind == "replace" else other + data)]
+        return first + rest
+
+    def _count(self, what: str) -> None:
+        self.happened[what] = self.happened.get(what, 0) + 1

@@ -1,0 +1,320 @@
+"""The client's end of the bus: a pseudo-terminal or a TCP socket."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from pathlib import Path
+import select
+import shutil
+import socket
+import tempfile
+import termios
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    import asyncio
+    from collections.abc import Callable
+
+READ_SIZE = 4096
+TTY_CHORE_INTERVAL = 0.02
+
+
+class Port(Protocol):
+    """What the bus needs of the client's end. All calls are on the bus thread."""
+
+    overruns: int
+    opened: int
+
+    @property
+    def url(self) -> str:
+        """Return what a client opens."""
+
+    @property
+    def connected(self) -> bool:
+        """Tell whether a client has it open."""
+
+    def plug(self) -> None:
+        """Make the port appear."""
+
+    def unplug(self) -> None:
+        """Make the port vanish, as a pulled adapter does."""
+
+    def write(self, data: bytes) -> None:
+        """Give bytes to the client; lost if there is none."""
+
+    def after_reply(self) -> None:
+        """Do what must be done after each reply."""
+
+    def close(self) -> None:
+        """Vanish for good."""
+
+
+class PtyPort:
+    """A pseudo-terminal behind a stable symbolic link."""
+
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        on_bytes: Callable[[bytes], None],
+        link: str | None,
+    ) -> None:
+        """Choose the path of the link; `plug` makes the terminal."""
+        self._loop = loop
+        self._on_bytes = on_bytes
+        self._own_folder = tempfile.mkdtemp(prefix="evse-bus-") if not link else None
+        self._link = Path(link) if link else Path(str(self._own_folder), "ttyEVSE")
+        self._master = -1
+        self._reading = False
+        self._timer: asyncio.TimerHandle | None = None
+        self.overruns = 0
+        self.opened = 0
+
+    @property
+    def url(self) -> str:
+        """Return the path of the link."""
+        return str(self._link)
+
+    @property
+    def connected(self) -> bool:
+        """Tell whether a client has the terminal open."""
+        return self._reading
+
+    def plug(self) -> None:
+        """Make a terminal and point the link at it."""
+        if self._master >= 0:
+            return
+        master, slave = os.openpty()
+        _make_raw(slave)
+        target = os.ttyname(slave)
+        # From now on a terminal without a client reports a hang-up: so that opening
+        # and closing can be seen.
+        os.close(slave)
+        os.set_blocking(master, False)
+        self._master = master
+        if self._link.is_symlink() or self._link.exists():
+            self._link.unlink()
+        self._link.symlink_to(target)
+        self._chore()
+
+    def unplug(self) -> None:
+        """Take the terminal and the link away: the client gets a hang-up."""
+        if self._master < 0:
+            return
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        self._stop_reading()
+        with contextlib.suppress(FileNotFoundError):
+            self._link.unlink()
+        os.close(self._master)
+        self._master = -1
+
+    def write(self, data: bytes) -> None:
+        """Give bytes to the client."""
+        if not self._reading:
+            return
+        try:
+            written = os.write(self._master, data)
+        except BlockingIOError:
+            written = 0
+        except OSError:
+            self._hung_up()
+            return
+        # A client that does not read loses bytes, as with a real UART.
+        self.overruns += len(data) - written
+
+    def after_reply(self) -> None:
+        """Keep the next open possible."""
+        self._forget_speed()
+
+    def close(self) -> None:
+        """Take everything away."""
+        self.unplug()
+        if self._own_folder is not None:
+            shutil.rmtree(self._own_folder, ignore_errors=True)
+
+    def _chore(self) -> None:
+        """See whether a client came, and keep the next open possible."""
+        self._timer = self._loop.call_later(TTY_CHORE_INTERVAL, self._chore)
+        if not self._reading and not self._no_client():
+            self._reading = True
+            self.opened += 1
+            self._loop.add_reader(self._master, self._readable)
+        self._forget_speed()
+
+    def _forget_speed(self) -> None:
+        """Set the terminal's speed to one that no client asks for.
+
+        The driver drops the parity flag, and the C library refuses an open (EINVAL) in
+        which nothing but the dropped flag would change. With another speed before it,
+        something always changes.
+        """
+        if self._master < 0:
+            return
+        with contextlib.suppress(OSError, termios.error):
+            attributes = termios.tcgetattr(self._master)
+            if attributes[4] != termios.B50:
+                attributes[4] = attributes[5] = termios.B50
+                termios.tcsetattr(self._master, termios.TCSANOW, attributes)
+
+    def _no_client(self) -> bool:
+        poll = select.poll()
+        poll.register(self._master, select.POLLIN)
+        events = poll.poll(0)
+        return bool(events) and bool(events[0][1] & select.POLLHUP)
+
+    def _readable(self) -> None:
+        try:
+            data = os.read(self._master, READ_SIZE)
+        except BlockingIOError:
+            return
+        except OSError:
+            self._hung_up()
+            return
+        if data:
+            self._on_bytes(data)
+
+    def _hung_up(self) -> None:
+        """Note that the client has closed; what it did not read is gone."""
+        self._stop_reading()
+        self._forget_speed()
+        with contextlib.suppress(OSError, termios.error):
+            termios.tcflush(self._master, termios.TCIOFLUSH)
+
+    def _stop_reading(self) -> None:
+        if self._reading:
+            self._reading = False
+            self._loop.remove_reader(self._master)
+
+
+class TcpPort:
+    """A TCP server for one client at a time, like a serial device server."""
+
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        on_bytes: Callable[[bytes], None],
+        port: int,
+    ) -> None:
+        """Choose the port (0 = any free one, kept from then on)."""
+        self._loop = loop
+        self._on_bytes = on_bytes
+        self._port = port
+        self._server: socket.socket | None = None
+        self._client: socket.socket | None = None
+        self.overruns = 0
+        self.opened = 0
+
+    @property
+    def url(self) -> str:
+        """Return the URL of the socket."""
+        return f"socket://127.0.0.1:{self._port}"
+
+    @property
+    def connected(self) -> bool:
+        """Tell whether a client is connected."""
+        return self._client is not None
+
+    def plug(self) -> None:
+        """Listen."""
+        if self._server is not None:
+            return
+        server = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        server.bind(("127.0.0.1", self._port))
+        server.listen(4)
+        server.setblocking(False)  # noqa: FBT003 - the call takes no keyword
+        self._port = server.getsockname()[1]
+        self._server = server
+        self._loop.add_reader(server.fileno(), self._accept)
+
+    def unplug(self) -> None:
+        """Close the connection and refuse new ones."""
+        self._drop_client()
+        if self._server is not None:
+            self._loop.remove_reader(self._server.fileno())
+            self._server.close()
+            self._server = None
+
+    def write(self, data: bytes) -> None:
+        """Give bytes to the client."""
+        if self._client is None:
+            return
+        try:
+            written = self._client.send(data)
+        except BlockingIOError:
+            written = 0
+        except OSError:
+            self._drop_client()
+            return
+        self.overruns += len(data) - written
+
+    def after_reply(self) -> None:
+        """Do nothing: a socket has no traps."""
+
+    def close(self) -> None:
+        """Take everything away."""
+        self.unplug()
+
+    def _accept(self) -> None:
+        if self._server is None:
+            return
+        try:
+            client, _ = self._server.accept()
+        except BlockingIOError:
+            return
+        if self._client is not None and not self._client_gone():
+            # One client at a time; the second one sees its connection closed.
+            client.close()
+            return
+        self._drop_client()
+        client.setblocking(False)  # noqa: FBT003 - the call takes no keyword
+        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._client = client
+        self.opened += 1
+        self._loop.add_reader(client.fileno(), self._readable)
+
+    def _client_gone(self) -> bool:
+        """Tell whether the client closed and we have not noticed yet."""
+        if self._client is None:
+            return True
+        try:
+            return not self._client.recv(1, socket.MSG_PEEK)
+        except BlockingIOError:
+            return False
+        except OSError:
+            return True
+
+    def _readable(self) -> None:
+        if self._client is None:
+            return
+        try:
+            data = self._client.recv(READ_SIZE)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if data:
+            self._on_bytes(data)
+        else:
+            self._drop_client()
+
+    def _drop_client(self) -> None:
+        if self._client is not None:
+            self._loop.remove_reader(self._client.fileno())
+            self._client.close()
+            self._client = None
+
+
+def _make_raw(slave: int) -> None:
+    """Set the terminal to pass bytes as they are: no echo, no line editing."""
+    attributes = termios.tcgetattr(slave)
+    attributes[0] = 0
+    attributes[1] = 0
+    attributes[2] = termios.CS8 | termios.CREAD | termios.CLOCAL
+    attributes[3] = 0
+    attributes[4] = attributes[5] = termios.B38400
+    attributes[6][termios.VMIN] = 1
+    attributes[6][termios.VTIME] = 0
+    termios.tcsetattr(slave, termios.TCSANOW, attributes)

@@ -1,0 +1,261 @@
+"""The pair of wires: one byte at a time, at the line's pace, and no mercy.
+
+Everything is scheduled by absolute time, so that errors of single timers do not add
+up. Bytes that overlap in time garble each other, whoever sent them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from .log import CLIENT, Entry
+
+if TYPE_CHECKING:
+    import asyncio
+    from collections.abc import Callable
+    from random import Random
+
+    from .faults import Faults
+    from .loop import PreciseLoop
+
+EPSILON = 1e-6
+# Two drivers against each other: no receiver sees either byte. The constant keeps two
+# equal bytes from cancelling their collision out.
+COLLISION_MASK = 0x55
+
+
+@dataclass(slots=True)
+class Transmission:
+    """Bytes of one sender, back to back from `start` on."""
+
+    source: str
+    data: bytes
+    start: float
+    byte_time: float
+    position: int = 0
+    heard: bytearray = field(default_factory=bytearray)
+    collided: bool = False
+
+    @property
+    def next_start(self) -> float:
+        """Return when the next byte begins."""
+        return self.start + self.position * self.byte_time
+
+    @property
+    def end(self) -> float:
+        """Return when the last byte is over."""
+        return self.start + len(self.data) * self.byte_time
+
+
+@dataclass(slots=True)
+class Segment:
+    """Bytes heard in a row, with the silence before them."""
+
+    start: float
+    byte_time: float
+    data: bytes
+    sources: tuple[str, ...]
+    silence_before: float
+
+    @property
+    def end(self) -> float:
+        """Return when the last byte was over."""
+        return self.start + len(self.data) * self.byte_time
+
+
+class Wire:
+    """Carries transmissions to the client (chunk by chunk) and to the devices."""
+
+    def __init__(
+        self,
+        byte_time: float,
+        granularity: float,
+        faults: Faults,
+        rng: Random,
+    ) -> None:
+        """Make a silent wire; `attach` gives it a loop and ears."""
+        self.byte_time = byte_time
+        self.faults = faults
+        self.collisions = 0
+        self.bytes_carried = 0
+        self._chunk = max(1, int(granularity / byte_time))
+        self._rng = rng
+        self._active: list[Transmission] = []
+        self._client_free = 0.0
+        self._last_end = float("-inf")
+        self._segments: list[Segment] = []
+        self._to_client = bytearray()
+        self._timer: asyncio.TimerHandle | None = None
+        self._timer_at = 0.0
+        self._loop: PreciseLoop | None = None
+
+    def attach(
+        self,
+        loop: PreciseLoop,
+        to_client: Callable[[bytes], None],
+        to_devices: Callable[[list[Segment]], None],
+        on_entry: Callable[[Entry], None],
+    ) -> None:
+        """Connect the ends."""
+        self._loop = loop
+        self._deliver_client = to_client
+        self._deliver_devices = to_devices
+        self._on_entry = on_entry
+
+    @property
+    def idle_from(self) -> float:
+        """Return when everything on the wire, or due to be, is over."""
+        return max([self._last_end, *(t.end for t in self._active)])
+
+    @property
+    def last_end(self) -> float:
+        """Return when the last byte heard was over."""
+        return self._last_end
+
+    def busy(self, now: float) -> bool:
+        """Tell whether somebody is sending right now."""
+        return any(t.start <= now < t.end for t in self._active)
+
+    def send_client(self, data: bytes) -> None:
+        """Take bytes the client wrote: they leave its UART one by one."""
+        if self._loop is None:
+            return
+        start = max(self._loop.time(), self._client_free)
+        last = next((t for t in reversed(self._active) if t.source == CLIENT), None)
+        if last is not None and start - last.end <= EPSILON:
+            # Still sending: the new bytes follow without a gap.
+            last.data += data
+            self._client_free = last.end
+            self._schedule()
+            return
+        self.send(CLIENT, data, start)
+        self._client_free = start + len(data) * self.byte_time
+
+    def send(self, source: str, data: bytes, start: float) -> None:
+        """Put bytes on the wire from `start` on (not in the past)."""
+        if not data:
+            return
+        self._active.append(Transmission(source, data, start, self.byte_time))
+        self._schedule()
+
+    def drop_pending(self) -> None:
+        """Stop all senders at once; what they sent so far is logged."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        for transmission in self._active:
+            self._log(transmission)
+        self._active.clear()
+
+    def _schedule(self) -> None:
+        """Set the timer to the next moment something is to be delivered."""
+        if not self._active or self._loop is None:
+            return
+        when = min(self._due(t) for t in self._active)
+        if self._timer is not None:
+            if self._timer_at <= when:
+                return
+            self._timer.cancel()
+        self._timer_at = when
+        self._timer = self._loop.call_at(when, self._pump)
+
+    def _due(self, transmission: Transmission) -> float:
+        if transmission.source == CLIENT and not self.faults.echo:
+            # Nobody reads along: devices get a whole run of bytes at its end.
+            return transmission.end
+        chunk_end = transmission.position + self._chunk
+        return min(
+            transmission.end, transmission.start + chunk_end * transmission.byte_time
+        )
+
+    def _pump(self) -> None:
+        """Move on everything whose time has come."""
+        self._timer = None
+        if self._loop is None:
+            return
+        now = self._loop.time() + EPSILON
+        finished = False
+        while self._active and self._step(now):
+            done = [t for t in self._active if t.position >= len(t.data)]
+            for transmission in done:
+                self._active.remove(transmission)
+                self._log(transmission)
+                finished = True
+        if self._to_client:
+            data = bytes(self._to_client)
+            self._to_client.clear()
+            self._deliver_client(data)
+        if finished:
+            segments, self._segments = self._segments, []
+            self._deliver_devices(segments)
+        self._schedule()
+
+    def _step(self, now: float) -> bool:
+        """Carry the earliest bytes; False if none is complete by now."""
+        first = min(self._active, key=lambda t: t.next_start)
+        others = [t for t in self._active if t is not first]
+        bt = first.byte_time
+        complete = int((now - first.start) / bt)
+        complete = min(complete, len(first.data)) - first.position
+        if complete <= 0:
+            return False
+        alone_until = min((t.next_start for t in others), default=float("inf"))
+        if alone_until < first.end - EPSILON:
+            alone = int((alone_until - first.start + EPSILON) / bt) - first.position
+            complete = min(complete, alone)
+        start = first.next_start
+        if complete > 0:
+            data = first.data[first.position : first.position + complete]
+            first.position += complete
+            data = self.faults.disturb(data, self._rng)
+            first.heard += data
+            self._hear(start, data, (first.source,))
+            return True
+        self._collide(first, others, start)
+        return True
+
+    def _collide(
+        self, first: Transmission, others: list[Transmission], start: float
+    ) -> None:
+        """Garble one byte with all that begin before it is over."""
+        value = first.data[first.position] ^ COLLISION_MASK
+        together = [first]
+        for other in others:
+            if other.next_start < start + first.byte_time - EPSILON:
+                value ^= other.data[other.position]
+                together.append(other)
+        for transmission in together:
+            transmission.position += 1
+            transmission.heard.append(value)
+            if not transmission.collided:
+                transmission.collided = True
+                self.collisions += 1
+        sources = tuple(sorted({t.source for t in together}))
+        self._hear(start, bytes((value,)), sources)
+
+    def _hear(self, start: float, data: bytes, sources: tuple[str, ...]) -> None:
+        silence = start - self._last_end
+        self._last_end = start + len(data) * self.byte_time
+        self.bytes_carried += len(data)
+        if sources != (CLIENT,) or self.faults.echo:
+            self._to_client += data
+        last = self._segments[-1] if self._segments else None
+        if last is not None and last.sources == sources and silence < EPSILON:
+            last.data += data
+        else:
+            self._segments.append(
+                Segment(start, self.byte_time, data, sources, silence)
+            )
+
+    def _log(self, transmission: Transmission) -> None:
+        self._on_entry(
+            Entry(
+                transmission.start,
+                transmission.end,
+                transmission.source,
+                transmission.data,
+                bytes(transmission.heard),
+                transmission.collided,
+            )
+        )
