@@ -1,0 +1,1 @@
+"""EVSE Bus: EV chargers on serial buses."""

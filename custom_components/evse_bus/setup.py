@@ -1,0 +1,100 @@
+"""From what the config flow stored to what the library is set up with. Pure."""
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+from homeassistant.const import CONF_ADDRESS
+
+from .const import (
+    CONF_BAUDRATE,
+    CONF_COMMAND,
+    CONF_FAIL_SAFE_CURRENT,
+    CONF_FAIL_SAFE_TIMEOUT,
+    CONF_INFORMATION,
+    CONF_INSTALLATION_LIMIT,
+    CONF_ORDER_LIFETIME,
+    CONF_PARITY,
+    CONF_PHASE_ORDER,
+    CONF_POLL_INTERVAL,
+    CONF_PROTOCOL,
+    CONF_SERIAL,
+    CONF_STOP_BITS,
+    CONF_VOLTAGE,
+)
+from .evse.framing import LineSettings
+from .evse.model import (
+    MINIMUM_CURRENT,
+    ChargerConfig,
+    CurrentLimit,
+    Orders,
+)
+from .evse.protocols import PROTOCOLS
+
+if TYPE_CHECKING:
+    from homeassistant.config_entries import ConfigSubentry
+
+    from .evse.protocol import Protocol
+
+_OPTIONAL_FIELDS: Final[Mapping[str, Callable[[Any], object]]] = {
+    CONF_SERIAL: str,
+    CONF_VOLTAGE: float,
+    CONF_POLL_INTERVAL: float,
+    CONF_ORDER_LIFETIME: lambda minutes: float(minutes) * 60,
+    # What single protocols add.
+    CONF_COMMAND: int,
+    CONF_INFORMATION: bytes.fromhex,
+    CONF_PHASE_ORDER: tuple,
+}
+"""Fields that may be missing or None, and how they are made of what is stored."""
+
+_DEFAULT_TIMEOUT: Final = 60
+
+
+def protocol_of(data: Mapping[str, Any]) -> Protocol:
+    """Return the protocol that a config entry's data names."""
+    return PROTOCOLS[data[CONF_PROTOCOL]]
+
+
+def line_settings(data: Mapping[str, Any]) -> LineSettings:
+    """Return how the port is opened: the protocol's way, unless overridden."""
+    usual = protocol_of(data).settings
+    return LineSettings(
+        baudrate=int(data.get(CONF_BAUDRATE, usual.baudrate)),
+        parity=data.get(CONF_PARITY, usual.parity),
+        stop_bits=int(data.get(CONF_STOP_BITS, usual.stop_bits)),
+    )
+
+
+def charger_config(data: Mapping[str, Any], subentry: ConfigSubentry) -> ChargerConfig:
+    """Return a charger's set-up, of the class that its protocol wants.
+
+    ``data`` is the config entry's, for the protocol.
+    """
+    stored = subentry.data
+    optional: dict[str, Any] = {
+        key: convert(stored[key])
+        for key, convert in _OPTIONAL_FIELDS.items()
+        if stored.get(key) is not None
+    }
+    return protocol_of(data).config(
+        key=subentry.subentry_id,
+        name=subentry.title,
+        address=int(stored[CONF_ADDRESS]),
+        installation_limit=float(stored[CONF_INSTALLATION_LIMIT]),
+        **optional,
+    )
+
+
+def first_orders(subentry: ConfigSubentry) -> Orders:
+    """Return the orders of a charger that never had any.
+
+    They are the fail-safe values that the user confirmed when adding it. Nobody
+    has said yet whether it may charge, so permission is the charger's own.
+    """
+    stored = subentry.data
+    fail_safe = float(stored.get(CONF_FAIL_SAFE_CURRENT, MINIMUM_CURRENT))
+    return Orders(
+        limit=CurrentLimit(current=fail_safe),
+        fail_safe=CurrentLimit(current=fail_safe),
+        fail_safe_timeout=int(stored.get(CONF_FAIL_SAFE_TIMEOUT, _DEFAULT_TIMEOUT)),
+    )
