@@ -53,6 +53,7 @@ class Charger(ABC):
         """Take the orders that stand; nothing is sent before the bus starts."""
         self.config = config
         self.orders = orders
+        self._wish = orders
         self.reading: ChargerReading | None = None
         self.info: ChargerInfo | None = None
         self.statistics = ChargerStatistics()
@@ -111,8 +112,14 @@ class Charger(ABC):
         """Have the regular exchange; may ask for a further turn."""
 
     @abstractmethod
-    async def impose(self, talk: Talk, orders: Orders) -> None:
+    async def impose(
+        self, talk: Talk, orders: Orders, change: OrderChange
+    ) -> Later[None] | None:
         """Make the charger follow these orders, through `clamp`; return when sure.
+
+        ``change`` is what made these orders of those before: only where it says
+        ``allowed=True`` has the user switched charging on just now; a box that is
+        paused stays so after any other change. May take further turns.
 
         Raises NotConfirmedError when the charger does not follow, and what
         `Talk.exchange` raises.
@@ -192,6 +199,7 @@ class Charger(ABC):
         loop = asyncio.get_running_loop()
         self._renewed = loop.time()
         self.orders_expired = False
+        self._wish = checked.apply(self._wish)
         lowered = cautious(self.orders, checked.apply(self.orders))
         if lowered != self.orders:
             self.orders = lowered
@@ -214,16 +222,37 @@ class Charger(ABC):
         job.step = partial(self._impose_job, job)
         await bus.submit(job)
 
-    async def _impose_job(self, job: Job, talk: Talk) -> None:
+    async def _impose_job(self, job: Job, talk: Talk) -> Later[None] | None:
         change = job.change or OrderChange()
-        target = change.apply(self.orders)
-        await self.impose(talk, target)
-        if target != self.orders:
-            self.orders = target
-            self.updated()
-            await self.commit(target)
-        else:
-            self.updated()
+        target = self.careful(change.apply(self.orders))
+        return await self._imposed(target, await self.impose(talk, target, change))
+
+    async def _imposed(
+        self, target: Orders, result: Later[None] | None
+    ) -> Later[None] | None:
+        """Let confirmed orders stand; until then, wait for what is to come later."""
+        if result is not None:
+            rest = result.step
+
+            async def go_on(talk: Talk) -> Later[None] | None:
+                return await self._imposed(target, await rest(talk))
+
+            return Later(result.pause, go_on)
+        stands = self.careful(target)
+        changed = stands != self.orders
+        self.orders = stands
+        self.updated()
+        if changed:
+            await self.commit(stands)
+        return None
+
+    def careful(self, orders: Orders) -> Orders:
+        """Return orders on their way, lowered to what the user has said since.
+
+        A newer lowering stands from the moment it was said, whatever becomes of
+        the commands before it and of its own sending.
+        """
+        return cautious(orders, self._wish)
 
     def expire_orders(self, now: float) -> bool:
         """Note that the orders' lifetime is over; return whether it just ended."""
