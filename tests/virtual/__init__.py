@@ -22,7 +22,7 @@ from .bus import VirtualBus
 from .car import Car, CarLife
 from .device import Device
 from .evbox import EvboxChargePoint, Module
-from .evbox_frames import Order, orders_in
+from .evbox_frames import Order, orders_in, rude_requests
 from .faults import Faults
 from .log import CLIENT, Entry, TrafficLog
 
@@ -46,4 +46,5 @@ __all__ = [
     "duty_of",
     "orders_in",
     "requests_in",
+    "rude_requests",
 ]

@@ -187,8 +187,8 @@ class Outlet:
         self.upstream_lost = False
         self._last_contact = now
         self._over = 0
-        if self.b2_needs_enable_after_power and self.car and self.car.plugged:
-            self.b1_b2_enabled = False
+        plugged = self.car is not None and self.car.plugged
+        self.b1_b2_enabled = not (self.b2_needs_enable_after_power and plugged)
         self.go("A1")
 
     def contact(self, now: float) -> None:

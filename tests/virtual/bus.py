@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from typing import TYPE_CHECKING
 
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from .wire import Segment
 
 TICK = 0.05
+ADVANCE_STEP = 0.25
+ADVANCE_STEPS = 200
 NO_PARITY_BITS = 10
 PARITY_BITS = 11
 
@@ -202,11 +205,14 @@ class VirtualBus(LoopThread):
         self.call(change)
 
     def advance(self, seconds: float) -> None:
-        """Let that much of the devices' time pass at once."""
+        """Let that much of the devices' time pass at once, in small steps."""
 
         def jump() -> None:
-            self._device_time += seconds
             self._step_devices()
+            steps = max(1, min(ADVANCE_STEPS, math.ceil(seconds / ADVANCE_STEP)))
+            for _ in range(steps):
+                self._device_time += seconds / steps
+                self._step_devices()
 
         self.call(jump)
 
@@ -291,8 +297,8 @@ class VirtualBus(LoopThread):
         self, device: Device, data: bytes, at: float, silence: float
     ) -> None:
         """Send at that time or later, as soon as the wire was silent so long."""
-        free_at = self.wire.idle_from + silence
         now = self.time()
+        free_at = self.wire.audible_until(now) + silence
         if max(at, free_at) <= now:
             self._send_due(device, data)
             return

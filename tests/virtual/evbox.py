@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 from .device import Device, on_bus_thread
 from .evbox_frames import (
     CHARGEPOINT,
+    SILENCE_TOLERANCE,
     SMARTGRID,
     FrameFinder,
     Heard,
@@ -25,8 +26,6 @@ if TYPE_CHECKING:
 
 MAX_MODULES = 20
 SILENCE = 0.1
-# Timers of a computer and of a box are not the same: nobody is blamed for this much.
-SILENCE_TOLERANCE = 0.001
 INTERVAL_TOLERANCE = 0.05
 IDLE_COS_PHI = 1.0
 ANY_SERIAL = "00000000"
@@ -113,7 +112,7 @@ class EvboxChargePoint(Device):
         min_interval: int = 1,
         commands: frozenset[int] | set[int] = frozenset({68, 69}),
         turn_round: float = 0.0,
-        jitter: float = 0.002,
+        jitter: float = 0.0002,
         name: str = "",
     ) -> None:
         """Make a ChargePoint; its limits are its maximum until an order comes."""

@@ -9,12 +9,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from .log import CLIENT
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from .log import Entry
     from .wire import Segment
 
+# Timers of a computer and of a box are not the same: nobody is blamed for this much.
+SILENCE_TOLERANCE = 0.001
 STX = 0x02
 ETX = 0x03
 CHARGEPOINT = "80"
@@ -166,6 +170,22 @@ def orders_in(entries: Iterable[Entry]) -> list[Order]:
             decoded = order(body, entry.end) if body is not None else None
             if decoded is not None:
                 result.append(decoded)
+    return result
+
+
+def rude_requests(entries: Iterable[Entry], silence: float = 0.1) -> list[Entry]:
+    """Return the client's frames that began without the silence before them.
+
+    "The module needs to verify the bus is available for at least 100 ms" (Topology).
+    """
+    result: list[Entry] = []
+    last_end = float("-inf")
+    for entry in sorted(entries, key=lambda e: e.t):
+        for index, byte in enumerate(entry.data if entry.source == CLIENT else b""):
+            gap = entry.t - last_end if index == 0 else 0.0
+            if byte == STX and gap < silence - SILENCE_TOLERANCE:
+                result.append(entry)
+        last_end = max(last_end, entry.end)
     return result
 
 

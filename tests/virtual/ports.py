@@ -17,7 +17,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 READ_SIZE = 4096
-TTY_CHORE_INTERVAL = 0.02
+# With a client; and without one, so that its first bytes need not wait long.
+CHORE_INTERVAL = 0.02
+AWAIT_INTERVAL = 0.005
 
 
 class Port(Protocol):
@@ -64,6 +66,7 @@ class PtyPort:
         self._on_bytes = on_bytes
         self._own_folder = tempfile.mkdtemp(prefix="evse-bus-") if not link else None
         self._link = Path(link) if link else Path(str(self._own_folder), "ttyEVSE")
+        self._slave_path = ""
         self._master = -1
         self._reading = False
         self._timer: asyncio.TimerHandle | None = None
@@ -86,7 +89,7 @@ class PtyPort:
             return
         master, slave = os.openpty()
         _make_raw(slave)
-        target = os.ttyname(slave)
+        self._slave_path = os.ttyname(slave)
         # From now on a terminal without a client reports a hang-up: so that opening
         # and closing can be seen.
         os.close(slave)
@@ -94,7 +97,7 @@ class PtyPort:
         self._master = master
         if self._link.is_symlink() or self._link.exists():
             self._link.unlink()
-        self._link.symlink_to(target)
+        self._link.symlink_to(self._slave_path)
         self._chore()
 
     def unplug(self) -> None:
@@ -136,12 +139,14 @@ class PtyPort:
 
     def _chore(self) -> None:
         """See whether a client came, and keep the next open possible."""
-        self._timer = self._loop.call_later(TTY_CHORE_INTERVAL, self._chore)
-        if not self._reading and not self._no_client():
+        # A client may also have come, written and gone since we last looked.
+        if not self._reading and self._somebody_was_here():
             self._reading = True
             self.opened += 1
             self._loop.add_reader(self._master, self._readable)
         self._forget_speed()
+        interval = CHORE_INTERVAL if self._reading else AWAIT_INTERVAL
+        self._timer = self._loop.call_later(interval, self._chore)
 
     def _forget_speed(self) -> None:
         """Set the terminal's speed to one that no client asks for.
@@ -158,11 +163,13 @@ class PtyPort:
                 attributes[4] = attributes[5] = termios.B50
                 termios.tcsetattr(self._master, termios.TCSANOW, attributes)
 
-    def _no_client(self) -> bool:
+    def _somebody_was_here(self) -> bool:
         poll = select.poll()
         poll.register(self._master, select.POLLIN)
         events = poll.poll(0)
-        return bool(events) and bool(events[0][1] & select.POLLHUP)
+        if not events:
+            return True
+        return bool(events[0][1] & select.POLLIN) or not events[0][1] & select.POLLHUP
 
     def _readable(self) -> None:
         try:
@@ -179,8 +186,13 @@ class PtyPort:
         """Note that the client has closed; what it did not read is gone."""
         self._stop_reading()
         self._forget_speed()
+        # Only the slave's end can throw away what waits to be read there.
         with contextlib.suppress(OSError, termios.error):
-            termios.tcflush(self._master, termios.TCIOFLUSH)
+            slave = os.open(self._slave_path, os.O_RDWR | os.O_NOCTTY)
+            try:
+                termios.tcflush(slave, termios.TCIFLUSH)
+            finally:
+                os.close(slave)
 
     def _stop_reading(self) -> None:
         if self._reading:

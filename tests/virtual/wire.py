@@ -108,6 +108,14 @@ class Wire:
         """Return when everything on the wire, or due to be, is over."""
         return max([self._last_end, *(t.end for t in self._active)])
 
+    def audible_until(self, now: float) -> float:
+        """Return the end of what a listener knows of at `now`.
+
+        A byte is heard when it is over: who begins before that collides.
+        """
+        heard = [t.end for t in self._active if t.start + t.byte_time <= now]
+        return max([self._last_end, *heard])
+
     @property
     def last_end(self) -> float:
         """Return when the last byte heard was over."""

@@ -1,0 +1,444 @@
+"""The virtual ABL box against the manual's and real boxes' bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from .abl import AblBox
+from .abl_frames import amps_of, duty_of, line, lrc, requests_in
+from .bus import VirtualBus
+from .car import Car
+from .raw_client import RawClient
+
+READ_FULL = b":0103002E0005C9\r\n"
+SET_10_A = b":0110001400010200A632\r\n"
+SET_OK = b">011000140001DA\r\n"
+FAILED = b">0190046B\r\n"
+SILENT = 0.05
+
+
+@contextmanager
+def line_to(*boxes: AblBox) -> Iterator[tuple[VirtualBus, RawClient]]:
+    with VirtualBus.pty(*boxes) as bus, RawClient(bus.url, "E") as client:
+        yield bus, client
+
+
+def write(register: int, value: int, box: int = 1) -> bytes:
+    numbers = (register, 1)
+    data = bytes((box, 0x10)) + b"".join(n.to_bytes(2, "big") for n in numbers)
+    return line(":", data + b"\x02" + value.to_bytes(2, "big"))
+
+
+def read(register: int, count: int, box: int = 1) -> bytes:
+    return line(":", bytes((box, 3, 0, register, 0, count)))
+
+
+def duty(answer: bytes) -> int:
+    return int(answer[11:15], 16) & 0x0FFF
+
+
+def state(answer: bytes) -> bytes:
+    return answer[9:11]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        # Manual, as printed.
+        ":010300010002F9",
+        ">01030401011237AD",
+        ":0103002E0005C9",
+        ":010300330003C6",
+        ":0110001400010200A632",
+        ">011000140001DA",
+        ">0190046B",
+        ":010300030001F8",
+        ">0103020327D0",
+        ">010304010F1509CA",
+        ">0103063300A1646464F6",
+        ":0103001400 05E3",
+        ">01030A140002490AFA020001FF8D",
+        ":010300500008A4",
+        ">0103105000325732327879303132333435363722",
+        ":01100013000102010BCD",
+        # Manual, with the LRC put right.
+        ">01030A2EC3810A006400640000AE",
+        ">0103063380C30A0A006C",
+        ">011000130001DB",
+        # Real boxes.
+        ">01030A2EA1106403E803E803E8EE",
+        ">01030A2EB2910B03E803E803E8B5",
+        ">01030A2EF4106403E803E803E89B",
+        ">01030204A155",
+        ">010304014150BEA8",
+    ],
+)
+def test_lrc_of_known_frames(text: str) -> None:
+    data = bytes.fromhex(text[1:])
+    assert lrc(data[:-1]) == data[-1]
+
+
+@pytest.mark.parametrize(
+    ("amps", "code"),
+    [(6, 100), (10, 166), (16, 266), (32, 533), (51, 850), (52, 850), (80, 960)],
+)
+def test_duty_is_rounded_down(amps: float, code: int) -> None:
+    assert duty_of(amps) == code
+    assert amps_of(code) <= amps
+
+
+def test_duty_ends() -> None:
+    assert duty_of(0) == 1000
+    assert amps_of(1000) == 0
+    assert amps_of(80) == 6
+    assert amps_of(79) == 0
+    assert amps_of(900) == pytest.approx(65)
+
+
+def test_reads_of_the_manual() -> None:
+    box = AblBox(1, firmware=(1, 2), hardware=0, meter=True)
+    with line_to(box) as (_, client):
+        assert client.ask(b":010300010002F9\r\n") == line(
+            ">", bytes.fromhex("01030401011234")
+        )
+        assert client.ask(b":010300030001F8\r\n") == b">0103020327D0\r\n"
+        assert client.ask(b":010300330003C6\r\n") == b">0103063300A1646464F6\r\n"
+        serial = b">0103105000325732327879303132333435363722\r\n"
+        assert client.ask(b":010300500008A4\r\n") == serial
+        assert client.ask(SET_10_A) == SET_OK
+        assert duty(client.ask(READ_FULL)) == 166
+
+
+def test_answers_of_real_boxes() -> None:
+    car = Car()
+    box = AblBox(1, car=car, firmware=(5, 0), cable_current=16, enable_input=2)
+    box.coding_resistor = True
+    box.unreadable_in_b2 = True
+    box.outlet.default_duty = 0x10B
+    box.outlet.cable_current = 20
+    with line_to(box) as (bus, client):
+        assert client.ask(b":010300010002F9\r\n") == b">010304014150BEA8\r\n"
+        client.ask(write(0x14, 100))
+        assert client.ask(READ_FULL) == b">01030A2EA1106403E803E803E8EE\r\n"
+        client.ask(write(0x14, 0x10B))
+        car.plug_in(request=False)
+        bus.advance(1)
+        assert client.ask(READ_FULL) == b">01030A2EB2910B03E803E803E8B5\r\n"
+        client.ask(write(0x14, 100))
+        box.outlet.meter = False
+        box.fail(4)
+        assert client.ask(READ_FULL) == b">01030A2EF4106403E803E803E89B\r\n"
+
+
+@pytest.mark.parametrize(
+    "request_bytes",
+    [
+        b":0103002E0005C8\r\n",  # LRC
+        read(0x14, 1),  # 0x14 cannot be read back
+        read(0x14, 5),
+        read(0x2E, 3),  # not the whole block
+        read(0x0F, 5),  # not in the manual: off by default
+        read(0x99, 1),
+        write(0x13, 0x10B),
+        line(":", bytes.fromhex("0106001400A6")),  # function 6
+        line(":", bytes.fromhex("01040001 0002")),
+        line(":", bytes.fromhex("011000140001 0400A600A6")),  # bytes and registers
+        line(":", bytes.fromhex("011000140002 0400A600A6")),  # two registers
+        read(0x2E, 5, box=2),
+        read(0x2E, 5, box=0),  # no broadcast for this one
+        read(0x2E, 5).replace(b":", b">"),
+        read(0x2E, 5).lower(),
+    ],
+)
+def test_silence(request_bytes: bytes) -> None:
+    box = AblBox(1)
+    with line_to(box) as (bus, client):
+        client.write(request_bytes)
+        assert client.read(1, SILENT) == b""
+        assert client.ask(READ_FULL).startswith(b">01030A2E")
+        assert box.writes == []
+        assert bus.log.bursts()[0].data == request_bytes
+
+
+@pytest.mark.parametrize("value", [0, 0x4F, 0x3E9, 0xFFFF])
+def test_limit_out_of_range_is_refused(value: int) -> None:
+    box = AblBox(1)
+    with line_to(box) as (_, client):
+        assert client.ask(write(0x14, value)) == FAILED
+        assert duty(client.ask(READ_FULL)) == 266
+        assert not box.writes[0].accepted
+        assert box.limits_written == []
+
+
+def test_ic_is_the_lowest() -> None:
+    box = AblBox(1, default_current=20, cable_current=13)
+    with line_to(box) as (_, client):
+        assert duty(client.ask(READ_FULL)) == duty_of(13)
+        client.ask(write(0x14, duty_of(10)))
+        assert duty(client.ask(READ_FULL)) == duty_of(10)
+        client.ask(write(0x14, duty_of(32)))
+        assert duty(client.ask(READ_FULL)) == duty_of(13)
+        client.ask(write(0x14, 0x3E8))
+        assert duty(client.ask(READ_FULL)) == 0x3E8
+
+
+def test_broadcast() -> None:
+    box = AblBox(7)
+    with line_to(box) as (_, client):
+        client.write(write(0x14, 166, box=0))
+        assert client.read(1, SILENT) == b""
+        assert box.writes[0].broadcast
+        assert box.limits_written == [166]
+        # "Broadcast supported: yes" for a read can only mean an answer.
+        assert client.ask(read(0x01, 2, box=0)).startswith(b">07030401")
+
+
+def test_a_car_charges_pauses_and_leaves() -> None:
+    car = Car(max_current=12, phases=2)
+    box = AblBox(1, car=car)
+    with line_to(box) as (bus, client):
+        assert state(client.ask(READ_FULL)) == b"A1"
+        car.plug_in(request=False)
+        assert state(client.ask(READ_FULL)) == b"B1"
+        bus.advance(1)
+        answer = client.ask(READ_FULL)
+        assert state(answer) == b"B2"
+        assert answer[11:].startswith(b"910A000000000000")
+        car.request()
+        bus.advance(10)
+        answer = client.ask(READ_FULL)
+        assert state(answer) == b"C2"
+        assert answer[11:].startswith(b"910A007800780000")
+        assert client.ask(b":010300330003C6\r\n").startswith(b">0103063380C20C0C00")
+        client.ask(SET_10_A)
+        bus.advance(10)
+        assert client.ask(READ_FULL)[11:].startswith(b"90A6006400640000")
+        client.ask(write(0x14, 0x3E8))
+        bus.advance(10)
+        answer = client.ask(READ_FULL)
+        assert state(answer) == b"B2"
+        assert answer[11:].startswith(b"93E8000000000000")
+        car.leave()
+        assert state(client.ask(READ_FULL)) == b"A1"
+
+
+@pytest.mark.parametrize(
+    ("before", "value", "after"),
+    [
+        ("A1", 0xE0E0, "E0"),
+        ("E0", 0xA1A1, "A1"),
+        ("A1", 0xE2E2, "E2"),
+        ("E0", 0xE2E2, "E2"),
+        ("E2", 0xA1A1, "A1"),
+        ("E2", 0x3838, "E2"),
+        ("A1", 0xF1F1, "F1"),
+        # Refused.
+        ("A1", 0xA1A1, None),
+        ("F3", 0xA1A1, None),
+        ("F3", 0xE0E0, None),
+        ("F3", 0xE2E2, None),
+        ("A1", 0x3838, None),
+        ("A1", 0x1234, None),
+        ("A1", 0x0000, None),
+    ],
+)
+def test_modify_state(before: str, value: int, after: str | None) -> None:
+    box = AblBox(1)
+    with line_to(box) as (bus, client):
+        bus.call(lambda: box.outlet.go(before))
+        answer = client.ask(write(0x05, value))
+        assert (answer == FAILED) is (after is None)
+        assert box.state == (after or before)
+
+
+def test_e0_hides_the_cable() -> None:
+    car = Car()
+    box = AblBox(1, car=car)
+    with line_to(box) as (bus, client):
+        car.plug_in()
+        bus.advance(10)
+        client.ask(write(0x05, 0xE0E0))
+        bus.advance(1)
+        answer = client.ask(READ_FULL)
+        assert state(answer) == b"E0"
+        assert not int(answer[11:15], 16) & 0x8000
+        assert car.current == 0
+
+
+def test_new_device_id_holds_after_the_reset() -> None:
+    box = AblBox(1, boot_time=0.05)
+    with line_to(box) as (bus, client):
+        assert client.ask(write(0x2C, 0xF005)) == FAILED
+        client.ask(write(0x05, 0xE2E2))
+        for wrong in (0xF000, 0xF011, 0xF105):
+            assert client.ask(write(0x2C, wrong)) == FAILED
+        client.ask(write(0x2C, 0xA005))
+        assert client.ask(READ_FULL).startswith(b">01")
+        assert client.ask(write(0x05, 0x5A5A)) == line(
+            ">", bytes.fromhex("011000050001")
+        )
+        bus.wait_for(lambda: box.resets)
+        client.write(read(0x01, 2, box=5))
+        assert client.read(1, 0.03) == b""
+        bus.wait_for(lambda: bus.time() > box._deaf_until)
+        answer = client.ask(read(0x01, 2, box=5))
+        assert answer.startswith(b">05030401")
+        assert int(answer[13:15], 16) & 0x40, "upstream time-out switched on"
+        assert box.outlet.b2_needs_enable_after_power
+        assert client.ask(READ_FULL, timeout=SILENT) == b""
+
+
+def test_icmax_does_not_survive() -> None:
+    box = AblBox(1, boot_time=0.01)
+    with line_to(box) as (bus, client):
+        client.ask(SET_10_A)
+        box.power_cycle()
+        bus.wait_for(lambda: bus.time() > box._deaf_until)
+        assert duty(client.ask(READ_FULL)) == 266
+
+
+def test_upstream_timeout_and_recovery() -> None:
+    car = Car()
+    box = AblBox(1, car=car, upstream_enabled=True, upstream_timeout=20)
+    with line_to(box) as (bus, client):
+        car.plug_in()
+        bus.advance(10)
+        client.ask(READ_FULL)
+        assert box.state == "C2"
+        bus.advance(21)
+        assert box.state == "F4"
+        assert car.current == 0
+        assert client.ask(read(0x06, 2))[9:13] == b"F480"
+        bus.advance(2)
+        client.ask(READ_FULL)
+        bus.advance(1)
+        assert box.state == "C2"
+
+
+def test_upstream_timeout_f14_only_reduces() -> None:
+    car = Car()
+    box = AblBox(1, car=car, upstream_enabled=True, upstream_timeout=20)
+    box.outlet.timeout_triggers_f4 = False
+    with line_to(box) as (bus, client):
+        car.plug_in()
+        bus.advance(10)
+        client.ask(READ_FULL)
+        bus.advance(21)
+        bus.advance(5)
+        assert box.state == "C3"
+        assert box.ic_amps == pytest.approx(9.96)
+        assert car.current == pytest.approx(9.96)
+        client.ask(READ_FULL)
+        bus.wait_for(lambda: box.state == "C2")
+
+
+@pytest.mark.parametrize("wakes_on", ["any", "own"])
+def test_the_first_request_after_a_sleep_is_lost(wakes_on: str) -> None:
+    box = AblBox(1, sleep_after=30, wake_time=0.05, wakes_on=wakes_on)  # type: ignore[arg-type]
+    with line_to(box) as (bus, client):
+        assert client.ask(READ_FULL, timeout=0.1) == b""
+        assert client.ask(READ_FULL) != b""
+        bus.advance(29)
+        assert client.ask(READ_FULL) != b""
+        bus.advance(31)
+        assert box.asleep
+        assert client.ask(READ_FULL, timeout=0.1) == b""
+        assert client.ask(READ_FULL) != b""
+        assert box.lost_asleep == 2
+
+
+def test_traffic_for_others_keeps_awake_only_if_so_set() -> None:
+    lazy = AblBox(2, sleep_after=30, wakes_on="own", wake_time=0.01)
+    light = AblBox(3, sleep_after=30, wakes_on="any", wake_time=0.01)
+    with line_to(AblBox(1), lazy, light) as (_, client):
+        client.ask(READ_FULL)
+        assert lazy.asleep
+        assert not light.asleep
+
+
+@pytest.mark.parametrize(
+    ("flag", "state_name", "bit"),
+    [("imbalance", "C4", 8), ("hot", "C3", 7), ("meter_failed", "C3", 6)],
+)
+def test_errors_that_reduce(flag: str, state_name: str, bit: int) -> None:
+    car = Car()
+    box = AblBox(1, car=car)
+    with line_to(box) as (bus, client):
+        car.plug_in()
+        bus.advance(10)
+        setattr(box.outlet, flag, True)
+        bus.advance(10)
+        assert box.state == state_name
+        answer = client.ask(READ_FULL)
+        assert int(answer[11:15], 16) & 0x4000
+        assert duty(answer) == 166
+        if flag == "meter_failed":
+            assert answer[15:27] == b"03E8" * 3
+        assert int(client.ask(read(0x06, 2))[11:15], 16) >> bit & 1
+
+
+def test_overcurrent_ends_in_f9() -> None:
+    car = Car(greedy=1.15, max_current=32)
+    box = AblBox(1, car=car)
+    with line_to(box) as (bus, client):
+        car.plug_in()
+        bus.advance(10)
+        bus.advance(1)
+        assert int(client.ask(read(0x06, 2))[11:15], 16) & 7 == 0b011
+        bus.advance(101)
+        assert box.state == "F9"
+
+
+def test_two_boxes_with_one_id_collide() -> None:
+    boxes = AblBox(1), AblBox(1, serial="2W22xy07654321")
+    with line_to(*boxes) as (bus, client):
+        client.write(READ_FULL)
+        bus.wait_for(lambda: bus.wire.collisions)
+        answer = client.read_line(timeout=SILENT)
+        assert line(">", bytes.fromhex("01030A2EA1110A03E803E803E8")) != answer
+        assert boxes[1].name == "abl-1#2"
+
+
+def test_defects() -> None:
+    car = Car(phases=1, first_phase=1)
+    box = AblBox(1, car=car)
+    with line_to(box) as (bus, client):
+        box.outlet.ignore_limit = True
+        assert client.ask(SET_10_A) == SET_OK
+        assert duty(client.ask(READ_FULL)) == 266
+        box.answer_register = 0x33
+        assert client.ask(READ_FULL).startswith(b">01030A33A1")
+        box.answer_register = None
+        box.l3_first = True
+        car.plug_in()
+        bus.advance(10)
+        assert client.ask(READ_FULL)[15:27] == b"0000" * 2 + b"00A0"
+        box.stop_locally()
+        assert state(client.ask(READ_FULL)) == b"E0"
+        box.start_locally()
+        box.set_by_somebody(8)
+        assert duty(client.ask(READ_FULL)) == 133
+
+
+def test_extra_registers() -> None:
+    box = AblBox(1, extra_registers=True)
+    with line_to(box) as (_, client):
+        assert client.ask(read(0x04, 1)) == b">01030204A155\r\n"
+        client.ask(SET_10_A)
+        data = bytes.fromhex(client.ask(read(0x0F, 5))[7:-4].decode())
+        assert int.from_bytes(data[6:8], "big") & 0x0FFF == 166
+
+
+def test_the_log_is_a_witness() -> None:
+    with line_to(AblBox(1)) as (bus, client):
+        client.ask(SET_10_A)
+        client.write(write(0x14, 500, box=9))
+        client.read(1, SILENT)
+        seen = requests_in(bus.log.bursts())
+    assert [(r.device_id, r.register, r.value) for r in seen] == [
+        (1, 0x14, 166),
+        (9, 0x14, 500),
+    ]

@@ -1,0 +1,70 @@
+"""The script: ready line, commands, counters, clean end."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+import json
+from pathlib import Path
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from .raw_client import RawClient
+
+SCRIPT = Path(__file__).parents[2] / "scripts" / "virtual-chargers"
+READ_FULL = b":0103002E0005C9\r\n"
+
+
+@contextmanager
+def running(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    process = subprocess.Popen(  # noqa: S603 - our own script
+        [sys.executable, str(SCRIPT), *arguments],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert process.stdout
+        word, protocol, url = process.stdout.readline().split()
+        assert (word, protocol) == ("ready", arguments[0])
+        yield process, url
+    finally:
+        process.terminate()
+        process.communicate(timeout=5)
+
+
+def test_abl(tmp_path: Path) -> None:
+    stats, link = tmp_path / "stats.json", tmp_path / "ttyABL"
+    arguments = ["--ids", "1", "2", "--dead", "2", "--control"]
+    arguments += ["--stats", str(stats), "--pty", str(link)]
+    with running("abl", *arguments) as (process, url):
+        assert url == str(link)
+        assert process.stdin
+        assert process.stdout
+        with RawClient(url, "E") as client:
+            assert client.ask(READ_FULL).startswith(b">01030A2EA1")
+            for text in ("plug 1", "others 1 0", "nonsense 1"):
+                process.stdin.write(text + "\n")
+                process.stdin.flush()
+            answers = [process.stdout.readline() for _ in range(3)]
+            assert answers[:2] == ["ok\n", "ok\n"]
+            assert answers[2].startswith("error nonsense 1: no such command")
+            answer = client.ask(READ_FULL)
+            assert answer[11:15] in (b"93E8", b"13E8")
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(5) == 0
+    counters = json.loads(stats.read_text())
+    assert counters["devices"]["abl-1"]["requests"] == 2
+    assert counters["devices"]["abl-2"]["requests"] == 0
+    assert not link.exists()
+
+
+@pytest.mark.usefixtures("socket_enabled")
+def test_evbox() -> None:
+    arguments = ["--serials", "7", "--modules", "3", "--tcp", "0"]
+    with running("evbox", *arguments) as (_, url), RawClient(url) as client:
+        request = b"\x0280A06900E6008C0154003C002800500046F703\x03"
+        assert client.ask(request, b"\x03")[15:17] == b"03"
