@@ -1,1 +1,90 @@
-"""EVSE Bus: EV chargers on serial buses."""
+"""EVSE Bus: EV chargers on serial buses.
+
+A config entry is one bus (one port), each charger on it is a config subentry.
+"""
+
+from typing import Final
+
+from homeassistant.const import EVENT_HOMEASSISTANT_STOP, Platform
+from homeassistant.core import HomeAssistant
+from homeassistant.helpers import config_validation as cv
+from homeassistant.helpers.device_registry import ChildDeviceEntry, DeviceEntry
+from homeassistant.helpers.typing import ConfigType
+
+from .const import DOMAIN
+from .coordinator import BusCoordinator, EvseBusConfigEntry
+from .errors import not_ready
+from .evse.model import LineError
+from .orders import OrderStore
+
+CONFIG_SCHEMA = cv.config_entry_only_config_schema(DOMAIN)
+
+PLATFORMS: Final = [
+    Platform.BINARY_SENSOR,
+    Platform.BUTTON,
+    Platform.NUMBER,
+    Platform.SENSOR,
+    Platform.SWITCH,
+]
+
+
+async def async_setup(
+    hass: HomeAssistant,  # noqa: ARG001 - Home Assistant's signature
+    config: ConfigType,  # noqa: ARG001 - there is no YAML
+) -> bool:
+    """Set up nothing: everything belongs to a bus."""
+    return True
+
+
+async def async_setup_entry(hass: HomeAssistant, entry: EvseBusConfigEntry) -> bool:
+    """Set up a bus and the chargers on it."""
+    coordinator = BusCoordinator(hass, entry)
+    try:
+        await coordinator.async_start()
+        entry.runtime_data = coordinator
+        await hass.config_entries.async_forward_entry_setups(entry, PLATFORMS)
+    except LineError as error:
+        await coordinator.async_stop()
+        raise not_ready(error, coordinator.port) from error
+    except BaseException:
+        # A bus left running would hold the port against the next try.
+        await coordinator.async_stop()
+        raise
+    entry.async_on_unload(entry.add_update_listener(_async_updated))
+    entry.async_on_unload(
+        hass.bus.async_listen_once(EVENT_HOMEASSISTANT_STOP, coordinator.async_stop)
+    )
+    return True
+
+
+async def async_unload_entry(hass: HomeAssistant, entry: EvseBusConfigEntry) -> bool:
+    """Close the port; the chargers' own fail-safe takes over."""
+    unloaded = await hass.config_entries.async_unload_platforms(entry, PLATFORMS)
+    if unloaded:
+        await entry.runtime_data.async_stop()
+    return unloaded
+
+
+async def async_remove_entry(hass: HomeAssistant, entry: EvseBusConfigEntry) -> None:
+    """Delete the stored orders of a bus that is no more."""
+    await OrderStore(hass, entry.entry_id).async_remove()
+
+
+async def async_remove_config_entry_device(
+    hass: HomeAssistant,  # noqa: ARG001 - Home Assistant's signature
+    entry: EvseBusConfigEntry,
+    device: DeviceEntry | ChildDeviceEntry,
+) -> bool:
+    """Return whether a device may be deleted: only a connector that is gone."""
+    return entry.runtime_data.forget_connector(
+        {key for domain, key in device.identifiers if domain == DOMAIN}
+    )
+
+
+async def _async_updated(hass: HomeAssistant, entry: EvseBusConfigEntry) -> None:
+    """Follow a changed set-up, without silencing chargers that did not change."""
+    coordinator = entry.runtime_data
+    if dict(entry.data) != coordinator.data:
+        hass.config_entries.async_schedule_reload(entry.entry_id)
+        return
+    await coordinator.async_match_subentries()

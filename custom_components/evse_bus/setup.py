@@ -55,6 +55,13 @@ def protocol_of(data: Mapping[str, Any]) -> Protocol:
     return PROTOCOLS[data[CONF_PROTOCOL]]
 
 
+def charger_unique_id(
+    protocol: str, serial: str | None, address: int | None = None
+) -> str:
+    """Return a charger subentry's unique id: its identity, else its address."""
+    return f"{protocol}_address_{address}" if serial is None else f"{protocol}_{serial}"
+
+
 def line_settings(data: Mapping[str, Any]) -> LineSettings:
     """Return how the port is opened: the protocol's way, unless overridden."""
     usual = protocol_of(data).settings

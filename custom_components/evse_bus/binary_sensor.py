@@ -1,0 +1,145 @@
+"""Binary sensors: plugged, charging, problem, and whether the port is open."""
+
+from collections.abc import Callable, Hashable, Iterable
+from dataclasses import dataclass
+from typing import Final, override
+
+from homeassistant.components.binary_sensor import (
+    BinarySensorEntity,
+    BinarySensorEntityDescription,
+)
+from homeassistant.components.binary_sensor.const import BinarySensorDeviceClass
+from homeassistant.const import EntityCategory, Platform
+from homeassistant.core import HomeAssistant
+from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
+
+from .coordinator import BusCoordinator, ChargerUnit, EvseBusConfigEntry
+from .entity import (
+    BusEntity,
+    ChargerEntity,
+    ConnectorEntity,
+    add_charger_entities,
+    supported,
+)
+from .evse.model import Capability, ConnectorReading
+
+PARALLEL_UPDATES = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConnectorBinarySensorDescription(BinarySensorEntityDescription):
+    """Something a charger says of one connector."""
+
+    capability: Capability
+    value: Callable[[ConnectorReading], bool | None]
+
+
+CONNECTOR_SENSORS: Final[tuple[ConnectorBinarySensorDescription, ...]] = (
+    ConnectorBinarySensorDescription(
+        key="plugged",
+        translation_key="plugged",
+        device_class=BinarySensorDeviceClass.PLUG,
+        capability=Capability.PLUGGED,
+        value=lambda reading: reading.plugged,
+    ),
+    ConnectorBinarySensorDescription(
+        key="charging",
+        device_class=BinarySensorDeviceClass.BATTERY_CHARGING,
+        capability=Capability.CHARGING,
+        value=lambda reading: reading.charging,
+    ),
+)
+
+PROBLEM: Final = BinarySensorEntityDescription(
+    key="problem", device_class=BinarySensorDeviceClass.PROBLEM
+)
+ORDERS_EXPIRED: Final = BinarySensorEntityDescription(
+    key="orders_expired",
+    translation_key="orders_expired",
+    entity_category=EntityCategory.DIAGNOSTIC,
+)
+CONNECTED: Final = BinarySensorEntityDescription(
+    key="connected",
+    device_class=BinarySensorDeviceClass.CONNECTIVITY,
+    entity_category=EntityCategory.DIAGNOSTIC,
+)
+
+
+async def async_setup_entry(
+    hass: HomeAssistant,  # noqa: ARG001 - Home Assistant's signature
+    entry: EvseBusConfigEntry,
+    async_add_entities: AddConfigEntryEntitiesCallback,
+) -> None:
+    """Set up the binary sensors of a bus and of its chargers."""
+    async_add_entities([ConnectedSensor(entry.runtime_data, CONNECTED)])
+    add_charger_entities(Platform.BINARY_SENSOR, entry, async_add_entities, _sensors)
+
+
+def _sensors(
+    coordinator: BusCoordinator, unit: ChargerUnit
+) -> Iterable[BinarySensorEntity]:
+    charger = unit.charger
+    yield ProblemSensor(coordinator, unit, PROBLEM)
+    if charger.config.order_lifetime is not None:
+        yield OrdersExpiredSensor(coordinator, unit, ORDERS_EXPIRED)
+    for number in sorted(unit.numbers):
+        for description in supported(charger, CONNECTOR_SENSORS):
+            yield ConnectorBinarySensor(coordinator, unit, number, description)
+
+
+class ConnectedSensor(BusEntity, BinarySensorEntity):
+    """Whether the port is open."""
+
+    @override
+    def show(self) -> Hashable:
+        """Show whether bytes can go out."""
+        self._attr_is_on = self.coordinator.bus.connected
+        return self._attr_is_on
+
+
+class ProblemSensor(ChargerEntity, BinarySensorEntity):
+    """Whether there is any fault, told by the charger or noticed by us."""
+
+    @override
+    def is_available(self) -> bool:
+        """Return whether there is anything to say; we notice some things ourselves."""
+        return self.charger.available or bool(self.charger.noticed)
+
+    @override
+    def show(self) -> Hashable:
+        """Show whether there is a fault."""
+        self._attr_is_on = bool(self.charger.faults)
+        return self._attr_is_on
+
+
+class OrdersExpiredSensor(ChargerEntity, BinarySensorEntity):
+    """Whether the fail-safe counts because nobody has renewed the orders."""
+
+    @override
+    def show(self) -> Hashable:
+        """Show whether the orders' lifetime is over."""
+        self._attr_is_on = self.charger.orders_expired
+        return self._attr_is_on
+
+
+class ConnectorBinarySensor(ConnectorEntity, BinarySensorEntity):
+    """Something a charger says of one connector."""
+
+    def __init__(
+        self,
+        coordinator: BusCoordinator,
+        unit: ChargerUnit,
+        number: int,
+        description: ConnectorBinarySensorDescription,
+    ) -> None:
+        """Be told with the connector."""
+        super().__init__(coordinator, unit, number, description)
+        self._value = description.value
+
+    @override
+    def show(self) -> Hashable:
+        """Show what the charger said."""
+        reading = self.reading
+        value = None if reading is None else self._value(reading)
+        self._attr_is_on = value
+        return value

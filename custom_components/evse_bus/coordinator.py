@@ -1,0 +1,333 @@
+"""One bus in Home Assistant: its chargers, their orders, and who is told what.
+
+It pushes: the bus decides when a charger is asked. Who listens does so for one
+context (the bus, its statistics, a charger, a connector), and is called only
+when something of that context changed.
+"""
+
+import asyncio
+from collections.abc import Callable
+from datetime import datetime, timedelta
+from functools import partial
+from typing import Any, Final, override
+
+from homeassistant.config_entries import ConfigEntry, ConfigSubentry
+from homeassistant.const import CONF_DEVICE
+from homeassistant.core import CALLBACK_TYPE, Event, HomeAssistant, callback
+from homeassistant.helpers.event import async_track_time_interval
+from homeassistant.helpers.update_coordinator import BaseDataUpdateCoordinatorProtocol
+
+from .const import CONF_SERIAL, LOGGER, SUBENTRY_CHARGER
+from .devices import BusDevices, connector_key
+from .evse.charger import Charger
+from .evse.model import ChargerConfig, ConnectorReading, Orders
+from .issues import BusIssues
+from .orders import OrderStore
+from .setup import (
+    charger_config,
+    charger_unique_id,
+    first_orders,
+    line_settings,
+    protocol_of,
+)
+
+type EvseBusConfigEntry = ConfigEntry[BusCoordinator]
+type Context = tuple[str, int | None]
+"""What a listener is interested in."""
+
+BUS: Final[Context] = ("bus", None)
+STATISTICS: Final[Context] = ("statistics", None)
+STATISTICS_INTERVAL: Final = timedelta(seconds=30)
+"""Counters change with every exchange; they are told this often."""
+
+
+class ChargerUnit:
+    """One charger and what the integration knows about it."""
+
+    def __init__(self, subentry: ConfigSubentry, charger: Charger) -> None:
+        """Start with nothing shown."""
+        self.subentry_id = subentry.subentry_id
+        self.subentry = subentry
+        self.charger = charger
+        """The library's charger; another one after the set-up was changed."""
+        self.device_id = ""
+        self.split = False
+        """Its connectors are devices of their own."""
+        self.added: set[tuple[str, str]] = set()
+        """Platform and unique id of the entities that exist."""
+        self.connectors: dict[int, ConnectorReading] = {}
+        """As last told to listeners; empty: the charger is not available."""
+        self.numbers: set[int] = set()
+        """Connectors seen since the start."""
+        self.shape: object = None
+        """Capabilities and connectors that entities have been made for."""
+        self.unsubscribe: CALLBACK_TYPE = lambda: None
+
+    @property
+    def name(self) -> str:
+        """Return what the user calls it."""
+        return self.charger.config.name
+
+    def connector(self, number: int) -> ConnectorReading | None:
+        """Return what is known of a connector now."""
+        reading = self.charger.reading
+        if reading is None or not self.charger.available:
+            return None
+        return reading.connectors.get(number)
+
+
+class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
+    """One bus."""
+
+    def __init__(self, hass: HomeAssistant, entry: EvseBusConfigEntry) -> None:
+        """Prepare the bus; nothing is opened or read yet."""
+        self.hass = hass
+        self.entry = entry
+        self.port: str = entry.data[CONF_DEVICE]
+        self.data = dict(entry.data)
+        """What the bus was made of: when that changes, it is made anew."""
+        self.protocol = protocol_of(entry.data)
+        self.bus = self.protocol.bus(
+            self.port, settings=line_settings(entry.data), name=entry.title
+        )
+        self.units: dict[str, ChargerUnit] = {}
+        self.issues = BusIssues(hass, entry)
+        self.devices = BusDevices(hass, entry, self.protocol.name)
+        self.orders = OrderStore(hass, entry.entry_id, self.issues.orders_written)
+        self._listeners: dict[Context, list[CALLBACK_TYPE]] = {}
+        self._adders: list[Callable[[ChargerUnit], None]] = []
+        self._stop_statistics: CALLBACK_TYPE | None = None
+        self._unsubscribe_bus: CALLBACK_TYPE = lambda: None
+        self._changing = asyncio.Lock()
+
+    # -- Life --------------------------------------------------------------------
+
+    async def async_start(self) -> None:
+        """Load the orders, then open the port; raises LineError."""
+        await self.orders.async_load()
+        self.devices.create_bus()
+        await self.async_match_subentries()
+        self._unsubscribe_bus = self.bus.subscribe(partial(self._notify, BUS))
+        await self.bus.start()
+
+    async def async_stop(self, _event: Event | None = None) -> None:
+        """Close the port and leave nothing behind."""
+        async with self._changing:
+            self._unsubscribe_bus()
+            self._unsubscribe_bus = lambda: None
+            await self.bus.stop()
+            for unit in self.units.values():
+                unit.unsubscribe()
+                unit.unsubscribe = lambda: None
+            await self.orders.async_close()
+            self.issues.clear()
+
+    # -- Chargers come, change and go --------------------------------------------
+
+    async def async_match_subentries(self) -> None:
+        """Make the chargers on the bus those of the subentries.
+
+        Only what differs is touched: the others keep talking.
+        """
+        async with self._changing:
+            wanted = {
+                subentry.subentry_id: subentry
+                for subentry in self.entry.get_subentries_of_type(SUBENTRY_CHARGER)
+            }
+            for key in self.units.keys() - wanted.keys():
+                await self._remove(self.units[key])
+            for key, subentry in wanted.items():
+                if (unit := self.units.get(key)) is None:
+                    await self._add(subentry)
+                else:
+                    await self._change(unit, subentry)
+            await self.orders.async_keep_only(wanted)
+
+    async def _add(self, subentry: ConfigSubentry) -> None:
+        key = subentry.subentry_id
+        orders = self.orders.get(key)
+        # Its device outlives restarts: there is one, so there were orders.
+        lost = orders is None and self.devices.has(key)
+        if orders is None:
+            orders = first_orders(subentry)
+            await self.orders.async_commit(key, orders)
+        charger = self.protocol.charger(
+            charger_config(self.entry.data, subentry), orders
+        )
+        unit = ChargerUnit(subentry, charger)
+        self.units[key] = unit
+        self.devices.show_charger(unit)
+        if lost:
+            self.issues.orders_lost(unit, orders)
+        self._connect(unit)
+        self._add_entities(unit)
+
+    def _connect(self, unit: ChargerUnit) -> None:
+        charger = unit.charger
+        charger.commit = partial(self._async_commit, unit)
+        unit.unsubscribe = charger.subscribe(partial(self._on_charger, unit))
+        self.bus.add(charger)
+
+    async def _async_commit(self, unit: ChargerUnit, orders: Orders) -> None:
+        self.issues.orders_renewed(unit)
+        await self.orders.async_commit(unit.subentry_id, orders)
+
+    async def _change(self, unit: ChargerUnit, subentry: ConfigSubentry) -> None:
+        unit.subentry = subentry
+        config = charger_config(self.entry.data, subentry)
+        old = unit.charger
+        if config == old.config:
+            return
+        LOGGER.debug("%s: its set-up was changed", config.name)
+        if _same_box(old.config, config):
+            old.config = config
+            self.devices.show_charger(unit)
+            self._on_charger(unit)
+            return
+        unit.unsubscribe()
+        await self.bus.remove(old)
+        self.issues.forget(unit)
+        unit.charger = self.protocol.charger(config, old.orders)
+        self.devices.show_charger(unit)
+        self._connect(unit)
+        self._on_charger(unit)
+
+    async def _remove(self, unit: ChargerUnit) -> None:
+        unit.unsubscribe()
+        await self.bus.remove(unit.charger)
+        del self.units[unit.subentry_id]
+        self.issues.forget(unit)
+
+    # -- What a charger tells ----------------------------------------------------
+
+    @callback
+    def _on_charger(self, unit: ChargerUnit) -> None:
+        charger = unit.charger
+        reading = charger.reading
+        before = unit.connectors
+        unit.connectors = (
+            dict(reading.connectors)
+            if reading is not None and charger.available
+            else {}
+        )
+        self._learn(unit)
+        self.issues.check(unit)
+        self._notify((unit.subentry_id, None))
+        for number in before.keys() | unit.connectors.keys():
+            if before.get(number) != unit.connectors.get(number):
+                self._notify((unit.subentry_id, number))
+
+    def _learn(self, unit: ChargerUnit) -> None:
+        """Show what was not known of a charger before."""
+        unit.numbers |= unit.connectors.keys()
+        shape = (unit.charger.capabilities, frozenset(unit.numbers), unit.charger.info)
+        if shape == unit.shape:
+            return
+        unit.shape = shape
+        self._bind_serial(unit)
+        self.devices.show_charger(unit)
+        self._add_entities(unit)
+
+    def _bind_serial(self, unit: ChargerUnit) -> None:
+        """Keep the serial number first found: from now on no other box will do."""
+        info = unit.charger.info
+        subentry = unit.subentry
+        if info is None or info.serial is None or subentry.data.get(CONF_SERIAL):
+            return
+        unique_id = charger_unique_id(self.protocol.key, info.serial)
+        if any(
+            other.unique_id == unique_id
+            for other in self.entry.subentries.values()
+            if other is not subentry
+        ):
+            return
+        self.hass.config_entries.async_update_subentry(
+            self.entry,
+            subentry,
+            data={**subentry.data, CONF_SERIAL: info.serial},
+            unique_id=unique_id,
+        )
+
+    def forget_connector(self, keys: set[str]) -> bool:
+        """Forget a connector by its device's identifiers, if it is gone."""
+        for unit in self.units.values():
+            for number in tuple(unit.numbers):
+                key = connector_key(unit, number)
+                if key in keys and number not in unit.connectors:
+                    unit.numbers.discard(number)
+                    unit.added = {
+                        (platform, unique_id)
+                        for platform, unique_id in unit.added
+                        if not unique_id.startswith(f"{key}_")
+                    }
+                    unit.shape = None
+                    return True
+        # Connectors of an earlier run that have not come back since.
+        return (
+            not any(
+                key in keys
+                for unit in self.units.values()
+                for key in (
+                    unit.subentry_id,
+                    *(connector_key(unit, number) for number in unit.numbers),
+                )
+            )
+            and self.entry.entry_id not in keys
+        )
+
+    # -- Entities ----------------------------------------------------------------
+
+    @callback
+    def async_add_platform(self, adder: Callable[[ChargerUnit], None]) -> None:
+        """Let a platform add entities for each charger, now and as more is learnt."""
+        self._adders.append(adder)
+        for unit in self.units.values():
+            adder(unit)
+
+    def _add_entities(self, unit: ChargerUnit) -> None:
+        for adder in self._adders:
+            adder(unit)
+
+    # -- Listeners ---------------------------------------------------------------
+
+    @callback
+    @override
+    def async_add_listener(
+        self, update_callback: CALLBACK_TYPE, context: Any = None
+    ) -> Callable[[], None]:
+        """Call back when something of this context has changed."""
+        key: Context = context or BUS
+        self._listeners.setdefault(key, []).append(update_callback)
+        if key == STATISTICS and self._stop_statistics is None:
+            self._stop_statistics = async_track_time_interval(
+                self.hass, self._tell_statistics, STATISTICS_INTERVAL
+            )
+        return partial(self._remove_listener, key, update_callback)
+
+    def _remove_listener(self, key: Context, update_callback: CALLBACK_TYPE) -> None:
+        listeners = self._listeners[key]
+        listeners.remove(update_callback)
+        if listeners:
+            return
+        del self._listeners[key]
+        if key == STATISTICS and self._stop_statistics is not None:
+            self._stop_statistics()
+            self._stop_statistics = None
+
+    @callback
+    def _tell_statistics(self, _now: datetime) -> None:
+        self._notify(STATISTICS)
+
+    @callback
+    def _notify(self, context: Context) -> None:
+        for update_callback in tuple(self._listeners.get(context, ())):
+            update_callback()
+
+
+def _same_box(old: ChargerConfig, new: ChargerConfig) -> bool:
+    """Return whether a charger can be told its new set-up while it runs."""
+    return (
+        type(old) is type(new)
+        and old.address == new.address
+        and (old.serial is None or old.serial == new.serial)
+    )

@@ -1,0 +1,108 @@
+"""The devices of a bus: the bus, its chargers behind it, their connectors."""
+
+from typing import TYPE_CHECKING
+
+from homeassistant.helpers import device_registry as dr, entity_registry as er
+from homeassistant.helpers.device_registry import ChildDeviceInfo, DeviceInfo
+
+from .const import DOMAIN, MANUFACTURER
+
+if TYPE_CHECKING:
+    from homeassistant.config_entries import ConfigEntry
+    from homeassistant.core import HomeAssistant
+
+    from .coordinator import ChargerUnit
+
+
+class BusDevices:
+    """The device registry's part of one config entry."""
+
+    def __init__(
+        self, hass: HomeAssistant, entry: ConfigEntry, protocol_name: str
+    ) -> None:
+        """Register nothing yet."""
+        self._hass = hass
+        self._entry = entry
+        self._protocol_name = protocol_name
+        self._registry = dr.async_get(hass)
+        self._bus_id = ""
+
+    def create_bus(self) -> None:
+        """Register the bus: chargers can hang on it only when it is there."""
+        device = self._registry.async_get_or_create(
+            config_entry_id=self._entry.entry_id,
+            identifiers={(DOMAIN, self._entry.entry_id)},
+            manufacturer=MANUFACTURER,
+            model=self._protocol_name,
+            name=self._entry.title,
+        )
+        self._bus_id = device.id
+
+    def has(self, subentry_id: str) -> bool:
+        """Return whether a charger was set up before."""
+        device = self._registry.async_get_device_by_identifier(
+            (DOMAIN, subentry_id), self._entry.entry_id
+        )
+        return device is not None
+
+    def show_charger(self, unit: ChargerUnit) -> None:
+        """Register a charger, or what has been learnt of it."""
+        info = unit.charger.info
+        device = self._registry.async_get_or_create(
+            config_entry_id=self._entry.entry_id,
+            config_subentry_id=unit.subentry_id,
+            identifiers={(DOMAIN, unit.subentry_id)},
+            name=unit.name,
+            via_device_id=self._bus_id,
+            manufacturer=info.manufacturer if info else None,
+            model=info.model if info else self._protocol_name,
+            serial_number=(info and info.serial) or unit.charger.config.serial,
+            sw_version=info.firmware if info else None,
+            hw_version=info.hardware if info else None,
+        )
+        unit.device_id = device.id
+        if not unit.split and (len(unit.numbers) > 1 or self._was_split(unit)):
+            unit.split = True
+            self._move_first_connector(unit)
+
+    def _move_first_connector(self, unit: ChargerUnit) -> None:
+        """Give the first connector a device of its own, now that there are more."""
+        child = self._registry.async_get_or_create_child(
+            config_entry_id=self._entry.entry_id,
+            config_subentry_id=unit.subentry_id,
+            **connector_info(unit, 1),
+        )
+        entities = er.async_get(self._hass)
+        prefix = f"{connector_key(unit, 1)}_"
+        for entity in er.async_entries_for_device(
+            entities, unit.device_id, include_disabled_entities=True
+        ):
+            if entity.unique_id.startswith(prefix):
+                entities.async_update_entity(entity.entity_id, device_id=child.id)
+
+    def _was_split(self, unit: ChargerUnit) -> bool:
+        """Return whether there was more than one connector before a restart."""
+        child = self._registry.async_get_child_device_by_identifier(
+            (DOMAIN, connector_key(unit, 1)), self._entry.entry_id
+        )
+        return child is not None
+
+
+def connector_key(unit: ChargerUnit, number: int) -> str:
+    """Return what a connector's identifiers and unique ids begin with."""
+    return f"{unit.subentry_id}_{number}"
+
+
+def charger_info(unit: ChargerUnit) -> DeviceInfo:
+    """Return what links an entity to its charger's device."""
+    return DeviceInfo(identifiers={(DOMAIN, unit.subentry_id)})
+
+
+def connector_info(unit: ChargerUnit, number: int) -> ChildDeviceInfo:
+    """Return a connector's device, as a part of its charger's."""
+    return ChildDeviceInfo(
+        identifiers={(DOMAIN, connector_key(unit, number))},
+        parent_device_id=unit.device_id,
+        translation_key="connector",
+        translation_placeholders={"number": str(number)},
+    )

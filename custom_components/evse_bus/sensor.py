@@ -1,0 +1,201 @@
+"""Sensors: what chargers say, and what the bus counts."""
+
+from collections.abc import Hashable, Iterable
+from typing import Any, override
+
+from homeassistant.components.sensor import RestoreSensor, SensorEntity
+from homeassistant.const import Platform
+from homeassistant.core import HomeAssistant
+from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
+
+from .coordinator import (
+    STATISTICS,
+    BusCoordinator,
+    ChargerUnit,
+    Context,
+    EvseBusConfigEntry,
+)
+from .entity import (
+    BusEntity,
+    ChargerEntity,
+    ConnectorEntity,
+    EvseBusEntity,
+    add_charger_entities,
+    supported,
+)
+from .evse.model import Capability, Fault
+from .sensor_tables import (
+    BUS_SENSORS,
+    CHARGER_SENSORS,
+    CHARGER_STATISTICS,
+    CONNECTOR_SENSORS,
+    ESTIMATED_ENERGY,
+    FAULT,
+    NO_FAULT,
+    BusSensorDescription,
+    ChargerSensorDescription,
+    ConnectorSensorDescription,
+)
+
+PARALLEL_UPDATES = 0
+
+
+async def async_setup_entry(
+    hass: HomeAssistant,  # noqa: ARG001 - Home Assistant's signature
+    entry: EvseBusConfigEntry,
+    async_add_entities: AddConfigEntryEntitiesCallback,
+) -> None:
+    """Set up the sensors of a bus and of its chargers."""
+    coordinator = entry.runtime_data
+    async_add_entities(
+        BusSensor(coordinator, description) for description in BUS_SENSORS
+    )
+    add_charger_entities(Platform.SENSOR, entry, async_add_entities, _sensors)
+
+
+def _sensors(coordinator: BusCoordinator, unit: ChargerUnit) -> Iterable[SensorEntity]:
+    charger = unit.charger
+    for description in supported(charger, CHARGER_SENSORS):
+        yield ChargerSensor(coordinator, unit, description)
+    for description in CHARGER_STATISTICS:
+        yield ChargerStatistic(coordinator, unit, description, STATISTICS)
+    if Capability.FAULTS in charger.capabilities:
+        yield FaultSensor(coordinator, unit, FAULT)
+    for number in sorted(unit.numbers):
+        for connector_description in supported(charger, CONNECTOR_SENSORS):
+            yield ConnectorSensor(coordinator, unit, number, connector_description)
+        if Capability.ESTIMATED_ENERGY in charger.capabilities:
+            yield EstimatedEnergySensor(coordinator, unit, number, ESTIMATED_ENERGY)
+
+
+class _ValueSensor(EvseBusEntity, SensorEntity):
+    """A sensor whose state is one value."""
+
+    @override
+    def show(self) -> Hashable:
+        """Show the value."""
+        self._attr_native_value = value = self.value()
+        return value
+
+    def value(self) -> str | float | None:
+        """Return what to show."""
+        raise NotImplementedError
+
+
+class BusSensor(BusEntity, _ValueSensor):
+    """A count of the bus."""
+
+    def __init__(
+        self, coordinator: BusCoordinator, description: BusSensorDescription
+    ) -> None:
+        """Be told from time to time."""
+        super().__init__(coordinator, description, STATISTICS)
+        self._value = description.value
+
+    @override
+    def value(self) -> str | float | None:
+        """Return what was counted."""
+        return self._value(self.coordinator)
+
+
+class ChargerSensor(ChargerEntity, _ValueSensor):
+    """Something a charger says of itself."""
+
+    def __init__(
+        self,
+        coordinator: BusCoordinator,
+        unit: ChargerUnit,
+        description: ChargerSensorDescription,
+        context: Context | None = None,
+    ) -> None:
+        """Be told with the charger, or in another context."""
+        super().__init__(coordinator, unit, description, context)
+        self._value = description.value
+
+    @override
+    def value(self) -> str | float | None:
+        """Return what the charger said."""
+        return self._value(self.charger)
+
+
+class ChargerStatistic(ChargerSensor):
+    """A count about a charger; there also when the charger does not answer."""
+
+    @override
+    def is_available(self) -> bool:
+        """Return true: how often it did not answer is best known then."""
+        return True
+
+
+class FaultSensor(ChargerEntity, SensorEntity):
+    """The most important fault; all of them are in the attributes."""
+
+    @override
+    def is_available(self) -> bool:
+        """Return whether there is anything to say; we notice some things ourselves."""
+        return self.charger.available or bool(self.charger.noticed)
+
+    @override
+    def show(self) -> Hashable:
+        """Show the first fault in the order of their list."""
+        faults = [fault for fault in Fault if fault in self.charger.faults]
+        reading = self.charger.reading
+        codes = reading.fault_codes if reading else ()
+        self._attr_native_value = faults[0] if faults else NO_FAULT
+        self._attr_extra_state_attributes: dict[str, Any] = {
+            "faults": [str(fault) for fault in faults],
+            "codes": list(codes),
+        }
+        return (tuple(faults), codes)
+
+
+class ConnectorSensor(ConnectorEntity, _ValueSensor):
+    """Something a charger says of one connector."""
+
+    def __init__(
+        self,
+        coordinator: BusCoordinator,
+        unit: ChargerUnit,
+        number: int,
+        description: ConnectorSensorDescription,
+    ) -> None:
+        """Be told with the connector."""
+        super().__init__(coordinator, unit, number, description)
+        self._value = description.value
+
+    @override
+    def value(self) -> str | float | None:
+        """Return what the charger said."""
+        reading = self.reading
+        return None if reading is None else self._value(reading)
+
+
+class EstimatedEnergySensor(ConnectorEntity, RestoreSensor):
+    """Estimated energy: summed by the library since its start, and by us before."""
+
+    @override
+    async def async_added_to_hass(self) -> None:
+        """Go on from where the last run ended."""
+        self._total = 0.0
+        self._counted_by: object = None
+        self._counted = 0.0
+        last = await self.async_get_last_sensor_data()
+        if last is not None and isinstance(last.native_value, (int, float)):
+            self._total = float(last.native_value)
+        await super().async_added_to_hass()
+
+    @override
+    def show(self) -> Hashable:
+        """Add what came since the last look."""
+        charger = self.charger
+        reading = self.reading
+        now = reading.estimated_energy if reading is not None else None
+        if now is not None:
+            if charger is not self._counted_by or now < self._counted:
+                # A charger made anew counts from 0.
+                self._counted_by = charger
+                self._counted = 0.0
+            self._total += now - self._counted
+            self._counted = now
+        self._attr_native_value = shown = round(self._total, 3)
+        return shown

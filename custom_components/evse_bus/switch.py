@@ -1,0 +1,149 @@
+"""Switches: may a car charge, and what the box itself can have on or off."""
+
+from collections.abc import Callable, Hashable, Iterable
+from dataclasses import dataclass
+from typing import Any, Final, override
+
+from homeassistant.components.switch import SwitchEntity, SwitchEntityDescription
+from homeassistant.const import EntityCategory, Platform
+from homeassistant.core import HomeAssistant
+from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
+
+from .coordinator import BusCoordinator, ChargerUnit, EvseBusConfigEntry
+from .entity import ChargerEntity, add_charger_entities, supported
+from .errors import translated_errors
+from .evse.charger import Charger
+from .evse.model import Capability, Command, OrderChange
+
+PARALLEL_UPDATES = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class CommandSwitchDescription(SwitchEntityDescription):
+    """Something of the box that a command sets and a reading shows."""
+
+    capability: Capability
+    command: Command
+    value: Callable[[Charger], bool | None]
+
+
+def _option(name: str) -> Callable[[Charger], bool | None]:
+    """Return how to read a configuration bit that the charger told."""
+
+    def value(charger: Charger) -> bool | None:
+        told = charger.info.options.get(name) if charger.info else None
+        return told if isinstance(told, bool) else None
+
+    return value
+
+
+ALLOWED: Final = SwitchEntityDescription(
+    key="charging_allowed", translation_key="charging_allowed"
+)
+
+COMMANDS: Final[tuple[CommandSwitchDescription, ...]] = (
+    CommandSwitchDescription(
+        key="outlet_enabled",
+        translation_key="outlet_enabled",
+        capability=Capability.OUTLET_ENABLED,
+        command=Command.SET_OUTLET,
+        value=lambda charger: (
+            None if charger.reading is None else charger.reading.outlet_enabled
+        ),
+    ),
+    CommandSwitchDescription(
+        key="upstream_timeout",
+        translation_key="upstream_timeout",
+        entity_category=EntityCategory.CONFIG,
+        capability=Capability.UPSTREAM_TIMEOUT,
+        command=Command.SET_UPSTREAM_TIMEOUT,
+        value=_option("upstream_timeout"),
+    ),
+    CommandSwitchDescription(
+        key="enable_after_power_cycle",
+        translation_key="enable_after_power_cycle",
+        entity_category=EntityCategory.CONFIG,
+        capability=Capability.ENABLE_AFTER_POWER_CYCLE,
+        command=Command.SET_ENABLE_AFTER_POWER_CYCLE,
+        value=_option("enable_after_power_cycle"),
+    ),
+)
+
+
+async def async_setup_entry(
+    hass: HomeAssistant,  # noqa: ARG001 - Home Assistant's signature
+    entry: EvseBusConfigEntry,
+    async_add_entities: AddConfigEntryEntitiesCallback,
+) -> None:
+    """Set up the switches of a bus's chargers."""
+    add_charger_entities(Platform.SWITCH, entry, async_add_entities, _switches)
+
+
+def _switches(coordinator: BusCoordinator, unit: ChargerUnit) -> Iterable[SwitchEntity]:
+    yield AllowedSwitch(coordinator, unit, ALLOWED)
+    for description in supported(unit.charger, COMMANDS):
+        yield CommandSwitch(coordinator, unit, description)
+
+
+class _ChargerSwitch(ChargerEntity, SwitchEntity):
+    """A switch of a charger."""
+
+    @override
+    async def async_turn_on(self, **kwargs: Any) -> None:
+        """Switch on; return when the charger follows."""
+        with translated_errors(self.unit.name, self.coordinator.port):
+            await self.turn(on=True)
+
+    @override
+    async def async_turn_off(self, **kwargs: Any) -> None:
+        """Switch off; return when the charger follows."""
+        with translated_errors(self.unit.name, self.coordinator.port):
+            await self.turn(on=False)
+
+    async def turn(self, *, on: bool) -> None:
+        """Tell the charger; raises EvseError."""
+        raise NotImplementedError
+
+
+class AllowedSwitch(_ChargerSwitch):
+    """Whether a car may charge; apart from how much."""
+
+    @override
+    def show(self) -> Hashable:
+        """Show what the charger says; where it cannot, what was ordered."""
+        reading = self.charger.reading
+        told = reading.allowed if reading is not None else None
+        ordered = self.charger.orders.allowed is not False
+        self._attr_is_on = ordered if told is None else told
+        return self._attr_is_on
+
+    @override
+    async def turn(self, *, on: bool) -> None:
+        """Order it."""
+        await self.charger.change_orders(OrderChange(allowed=on))
+
+
+class CommandSwitch(_ChargerSwitch):
+    """Something of the box that a command sets and a reading shows."""
+
+    def __init__(
+        self,
+        coordinator: BusCoordinator,
+        unit: ChargerUnit,
+        description: CommandSwitchDescription,
+    ) -> None:
+        """Belong to the charger."""
+        super().__init__(coordinator, unit, description)
+        self._value = description.value
+        self._command = description.command
+
+    @override
+    def show(self) -> Hashable:
+        """Show what the charger says."""
+        self._attr_is_on = self._value(self.charger)
+        return self._attr_is_on
+
+    @override
+    async def turn(self, *, on: bool) -> None:
+        """Command it."""
+        await self.charger.command(self._command, on)
