@@ -245,7 +245,8 @@ class Bus:
             _LOGGER.debug("%s: %s", self.name, error)
             self.wire.statistics.line_busy += 1
         now = asyncio.get_running_loop().time()
-        charger.slot.ready = now + self.wire.timing.silence_patience
+        patience = self.wire.timing.silence_patience
+        charger.slot.ready = now + max(patience, charger.minimum_pause(now))
 
     async def _job_turn(self, job: Job) -> None:
         if job.future.cancelled():
@@ -328,9 +329,11 @@ class Bus:
     def _on_open(self) -> None:
         self.connected = True
         self.wire.reset()
+        now = asyncio.get_running_loop().time()
         for charger in self.chargers.values():
             charger.on_line_open()
-            charger.slot.ready = 0.0
+            # It may have heard us a moment ago, before the line was lost.
+            charger.slot.ready = now + charger.minimum_pause(now)
         self._tell()
 
     def _on_lost(self, error: LineLostError) -> None:

@@ -33,6 +33,8 @@ class Wire:
         self.frames = FrameLog()
         self.on_unasked: Callable[[Frame], bool] = lambda _frame: False
         """Called with a good frame that is no answer; returns whether it was ours."""
+        self.sent_at: float | None = None
+        """Loop time at which the last request had left; ``None``: it did not."""
         self._framer = framer
         self._pending: _PendingReply | None = None
         line.on_data = self._on_data
@@ -61,12 +63,14 @@ class Wire:
         reply_may_equal: bool = False,
     ) -> T:
         """Send a request and wait for its answer (see `Talk.exchange`)."""
+        self.sent_at = None
         await self._silence()
         loop = asyncio.get_running_loop()
         self._framer.reset()
         bad, noise = self._framer.bad, self._framer.noise
         started = loop.time()
         sent = self.line.write(request, reply_may_equal=reply_may_equal)
+        self.sent_at = sent
         pending = _PendingReply(
             accept,
             first_byte_by=sent + self.timing.reply_timeout,
@@ -148,6 +152,14 @@ class Talk:
     def now(self) -> float:
         """Return the loop time, s."""
         return asyncio.get_running_loop().time()
+
+    @property
+    def sent_at(self) -> float | None:
+        """Return the loop time at which our last request had left, s.
+
+        ``None``: it was not sent (no silence to speak in, or the line was lost).
+        """
+        return self._wire.sent_at
 
     async def exchange[F: Frame, T](
         self,

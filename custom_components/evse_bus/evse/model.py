@@ -263,6 +263,9 @@ class ConnectorReading:
     """Power from measured voltage, current and cos phi, W."""
     energy: float | None = None
     """Meter total, Wh."""
+    meter_generation: int = 0
+    """Counts up when another meter may be behind this number (EVBox: modules have
+    no identity): a total must not be carried over such a change."""
     estimated_power: float | None = None
     """Power from measured current and a configured voltage, W."""
     estimated_energy: float | None = None
