@@ -1,0 +1,275 @@
+"""Set up a bus: protocol, port, search, chargers; change its port later."""
+
+from collections.abc import Mapping
+from typing import Any, Final, override
+
+from homeassistant.config_entries import (
+    ConfigEntry,
+    ConfigEntryState,
+    ConfigFlow,
+    ConfigFlowContext,
+    ConfigFlowResult,
+    ConfigSubentryData,
+    ConfigSubentryFlow,
+)
+from homeassistant.const import CONF_DEVICE
+from homeassistant.core import callback
+from homeassistant.data_entry_flow import AbortFlow
+
+from .const import (
+    CONF_FAIL_SAFE_CURRENT,
+    CONF_FAIL_SAFE_TIMEOUT,
+    CONF_INSTALLATION_LIMIT,
+    CONF_PROTOCOL,
+    DOMAIN,
+    SUBENTRY_CHARGER,
+)
+from .evse.model import RefusedOrderError, ScanReport
+from .evse.protocol import Progress, Protocol
+from .evse.protocols import PROTOCOLS
+from .flow_scan import (
+    Imposed,
+    async_search,
+    async_try_port,
+    imposed,
+    is_same_port,
+    nothing_imposed,
+    port_name,
+)
+from .flow_schema import (
+    ADDRESSES,
+    Errors,
+    bus_data,
+    check_impose,
+    impose_form,
+    port_form,
+    port_suggestions,
+    protocol_form,
+    typed_addresses,
+)
+from .flow_steps import ChargerSteps
+from .setup import line_settings, protocol_of
+from .subentry_flow import ChargerSubentryFlow
+
+_URL_EXAMPLES: Final = "`socket://192.0.2.5:4001` or `rfc2217://192.0.2.5:2217`"
+"""Not for translators: what is typed is the same everywhere."""
+
+
+class EvseBusConfigFlow(
+    ChargerSteps[ConfigFlowContext, ConfigFlowResult, str], ConfigFlow, domain=DOMAIN
+):
+    """Set up one bus."""
+
+    VERSION = 1
+    MINOR_VERSION = 1
+
+    several = True
+    step_after_error = "port"
+
+    def __init__(self) -> None:
+        """Start with nothing chosen."""
+        super().__init__()
+        self._searches: list[Imposed] = []
+
+    @classmethod
+    @callback
+    @override
+    def async_get_supported_subentry_types(
+        cls, config_entry: ConfigEntry
+    ) -> dict[str, type[ConfigSubentryFlow]]:
+        """Return what can be added to a bus."""
+        return {SUBENTRY_CHARGER: ChargerSubentryFlow}
+
+    # -- Protocol and port -------------------------------------------------------
+
+    @override
+    async def async_step_user(
+        self, user_input: dict[str, Any] | None = None
+    ) -> ConfigFlowResult:
+        """Choose the protocol."""
+        if user_input is not None:
+            self.protocol = PROTOCOLS[user_input[CONF_PROTOCOL]]
+            return await self.async_step_port()
+        return self.async_show_form(step_id="user", data_schema=protocol_form())
+
+    async def async_step_port(
+        self, user_input: dict[str, Any] | None = None
+    ) -> ConfigFlowResult:
+        """Choose the port; open it once, and send nothing."""
+        errors = self.take_error()
+        if user_input is not None:
+            errors = await self._async_check_port(self.protocol, user_input)
+            if not errors:
+                if self.protocol.probe_imposes:
+                    return await self.async_step_impose()
+                self._searches = nothing_imposed(self.protocol)
+                return await self.async_step_scan()
+        usual = self.protocol.settings
+        return self.async_show_form(
+            step_id="port",
+            data_schema=self.add_suggested_values_to_schema(
+                port_form(usual), user_input
+            ),
+            errors=errors,
+            description_placeholders=_port_placeholders(self.protocol),
+        )
+
+    async def _async_check_port(
+        self,
+        protocol: Protocol,
+        typed: dict[str, Any],
+        entry: ConfigEntry | None = None,
+    ) -> Errors:
+        """Set `bus_data`, or return what is wrong; ``entry`` is being changed.
+
+        Aborts when another bus has the port.
+        """
+        try:
+            self.bus_data = bus_data(protocol, typed)
+        except RefusedOrderError:
+            return {"base": "bad_baudrate"}
+        device = self.bus_data[CONF_DEVICE]
+        if not device:
+            return {CONF_DEVICE: "no_port"}
+        for other in self._async_current_entries(include_ignore=False):
+            if not await self.hass.async_add_executor_job(
+                is_same_port, device, other.data[CONF_DEVICE]
+            ):
+                continue
+            if other is not entry:
+                raise AbortFlow("already_configured")
+            if entry.state is ConfigEntryState.LOADED:
+                # We have it open ourselves: it exists and is ours to use.
+                return {}
+        error = await async_try_port(device, line_settings(self.bus_data))
+        return {"base": error} if error else {}
+
+    # -- Values to impose, where a search sets limits ----------------------------
+
+    async def async_step_impose(
+        self,
+        user_input: dict[str, Any] | None = None,  # noqa: ARG002 - a step's signature
+    ) -> ConfigFlowResult:
+        """Say that a search sets limits, and choose how to search."""
+        return self.async_show_menu(
+            step_id="impose",
+            menu_options=["search_single", "search_addresses", "manual"],
+            description_placeholders=self.placeholders(),
+        )
+
+    async def async_step_search_single(
+        self, user_input: dict[str, Any] | None = None
+    ) -> ConfigFlowResult:
+        """Ask what to set on the one box of a point-to-point line."""
+        return await self._async_impose("search_single", user_input)
+
+    async def async_step_search_addresses(
+        self, user_input: dict[str, Any] | None = None
+    ) -> ConfigFlowResult:
+        """Ask which boxes to look for, and what to set on them."""
+        return await self._async_impose("search_addresses", user_input)
+
+    async def _async_impose(
+        self, step_id: str, user_input: dict[str, Any] | None
+    ) -> ConfigFlowResult:
+        single = step_id == "search_single"
+        errors: Errors = {}
+        if user_input is not None:
+            errors = check_impose(self.protocol, user_input)
+            everybody = ADDRESSES[self.protocol.key].any
+            addresses = [everybody] if single and everybody is not None else []
+            if not single:
+                addresses, wrong = typed_addresses(self.protocol, user_input)
+                errors |= wrong
+            if not errors:
+                self._searches = imposed(self.protocol, addresses, user_input)
+                self.suggestions |= {
+                    key: user_input[key]
+                    for key in (
+                        CONF_INSTALLATION_LIMIT,
+                        CONF_FAIL_SAFE_CURRENT,
+                        CONF_FAIL_SAFE_TIMEOUT,
+                    )
+                }
+                return await self.async_step_scan()
+        return self.async_show_form(
+            step_id=step_id,
+            data_schema=self.add_suggested_values_to_schema(
+                impose_form(self.protocol, ask_addresses=not single),
+                self.suggestions | (user_input or {}),
+            ),
+            errors=errors,
+            description_placeholders=self.placeholders(),
+        )
+
+    # -- Search and store --------------------------------------------------------
+
+    @override
+    def choices(self) -> tuple[str, ...]:
+        """Return where one can go when a search brought nothing to add."""
+        other_values = ("impose",) if self.protocol.probe_imposes else ()
+        return ("scan", *other_values, "manual", "port")
+
+    @override
+    async def async_scan(self, progress: Progress) -> ScanReport:
+        """Open the port for a search, and close it again whatever happens."""
+        bus = self.protocol.bus(
+            self.bus_data[CONF_DEVICE], settings=line_settings(self.bus_data)
+        )
+        try:
+            await bus.start()
+            return await async_search(self.protocol, bus, self._searches, progress)
+        finally:
+            await bus.stop()
+
+    @override
+    def finish(self, chargers: list[ConfigSubentryData]) -> ConfigFlowResult:
+        """Create the bus with its chargers."""
+        return self.async_create_entry(
+            title=_title(self.bus_data), data=self.bus_data, subentries=chargers
+        )
+
+    # -- Later -------------------------------------------------------------------
+
+    async def async_step_reconfigure(
+        self, user_input: dict[str, Any] | None = None
+    ) -> ConfigFlowResult:
+        """Change the port or its settings."""
+        entry = self._get_reconfigure_entry()
+        protocol = protocol_of(entry.data)
+        errors: Errors = {}
+        if user_input is not None:
+            errors = await self._async_check_port(protocol, user_input, entry)
+            if not errors:
+                # Who gave the bus a name of their own keeps it.
+                own = entry.title != _title(entry.data)
+                title = entry.title if own else _title(self.bus_data)
+                # A loaded bus listens for changes and reloads by itself.
+                update = (
+                    self.async_update_and_abort
+                    if entry.update_listeners
+                    else self.async_update_reload_and_abort
+                )
+                return update(entry, title=title, data=self.bus_data)
+        suggestions = port_suggestions(entry.data, line_settings(entry.data))
+        return self.async_show_form(
+            step_id="reconfigure",
+            data_schema=self.add_suggested_values_to_schema(
+                port_form(protocol.settings), user_input or suggestions
+            ),
+            errors=errors,
+            description_placeholders=_port_placeholders(protocol),
+        )
+
+
+def _port_placeholders(protocol: Protocol) -> dict[str, str]:
+    return {
+        "protocol": protocol.name,
+        "settings": str(protocol.settings),
+        "examples": _URL_EXAMPLES,
+    }
+
+
+def _title(data: Mapping[str, Any]) -> str:
+    """Return a bus's name, as long as nobody gave it another."""
+    return f"{protocol_of(data).name} bus ({port_name(data[CONF_DEVICE])})"

@@ -1,0 +1,226 @@
+"""The form for one charger: what is asked, what is refused, what is stored. Pure."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, Final
+
+from homeassistant.const import CONF_ADDRESS, CONF_NAME
+from homeassistant.data_entry_flow import section
+from homeassistant.helpers.selector import TextSelector
+import probatio as vol
+
+from .const import (
+    CONF_COMMAND,
+    CONF_FAIL_SAFE_CURRENT,
+    CONF_FAIL_SAFE_TIMEOUT,
+    CONF_INFORMATION,
+    CONF_INSTALLATION_LIMIT,
+    CONF_ORDER_LIFETIME,
+    CONF_PHASE_ORDER,
+    CONF_POLL_INTERVAL,
+    CONF_SERIAL,
+    CONF_VOLTAGE,
+)
+from .evse.model import MINIMUM_CURRENT
+from .evse.safety import MAXIMUM_TIMEOUT
+from .flow_schema import (
+    ADDRESSES,
+    DEFAULT_FAIL_SAFE_TIMEOUT,
+    SUGGESTED_LIMIT,
+    Errors,
+    amperes,
+    check_currents,
+    check_timeout,
+    default_of,
+    dropdown,
+    is_number,
+    quantity,
+    suggest,
+)
+
+if TYPE_CHECKING:
+    from homeassistant.config_entries import ConfigSubentry
+
+    from .evse.model import FoundCharger
+    from .evse.protocol import Protocol
+
+CONF_EXPERT: Final = "expert"
+
+LONGEST_POLL_INTERVAL: Final = 3600
+LONGEST_ORDER_LIFETIME: Final = 7 * 24 * 60
+INFORMATION_BYTES: Final = 16
+PHASE_ORDERS: Final = ("123", "132", "213", "231", "312", "321")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Candidate:
+    """A charger on its way into the configuration."""
+
+    address: int
+    found: FoundCharger | None = None
+    """What it told, if it has been asked and has answered."""
+
+    def serial(self, protocol: Protocol) -> str | None:
+        """Return its serial number, as far as known."""
+        if self.found is not None and self.found.serial is not None:
+            return self.found.serial
+        return ADDRESSES[protocol.key].serial(self.address)
+
+    def placeholders(self, protocol: Protocol) -> dict[str, str]:
+        """Return what is known of it, for the texts."""
+        told = self.found
+        maximum = told.maximum_current if told else None
+        return {
+            "address": ADDRESSES[protocol.key].show(self.address),
+            "model": f"{told.info.manufacturer} {told.info.model}" if told else "?",
+            "serial": self.serial(protocol) or "?",
+            "maximum": f"{maximum:g} A" if maximum is not None else "?",
+        }
+
+
+def default_name(protocol: Protocol, address: int) -> str:
+    """Return the name offered for a charger."""
+    return f"{protocol.name} {ADDRESSES[protocol.key].show(address)}"
+
+
+# -- The form --------------------------------------------------------------------
+
+
+def charger_form(
+    protocol: Protocol, *, ask_address: bool = False, new: bool = True
+) -> vol.Schema:
+    """Ask for one charger's name, limits and, collapsed, everything else.
+
+    ``ask_address``: also where it is and who it must be. The fail-safe values are
+    asked only of a new charger: later they are entities of its own.
+    """
+    address = ADDRESSES[protocol.key]
+    form: dict[vol.Marker, object] = {vol.Required(CONF_NAME): TextSelector()}
+    if ask_address:
+        form[vol.Required(address.one)] = address.selector
+        if not address.is_serial:
+            form[vol.Optional(CONF_SERIAL)] = TextSelector()
+    form[suggest(CONF_INSTALLATION_LIMIT, SUGGESTED_LIMIT)] = amperes(MINIMUM_CURRENT)
+    if new:
+        form[vol.Required(CONF_FAIL_SAFE_CURRENT, default=MINIMUM_CURRENT)] = amperes()
+        if protocol.probe_imposes:
+            form[
+                vol.Required(CONF_FAIL_SAFE_TIMEOUT, default=DEFAULT_FAIL_SAFE_TIMEOUT)
+            ] = quantity(1, MAXIMUM_TIMEOUT, 1, "s")
+    form[vol.Required(CONF_EXPERT)] = section(
+        _expert_form(protocol), {"collapsed": True}
+    )
+    return vol.Schema(form)
+
+
+def _expert_form(protocol: Protocol) -> vol.Schema:
+    form: dict[vol.Marker, object] = {
+        vol.Required(
+            CONF_POLL_INTERVAL, default=default_of(protocol, CONF_POLL_INTERVAL)
+        ): quantity(0, LONGEST_POLL_INTERVAL, 0.1, "s"),
+        vol.Required(CONF_VOLTAGE, default=default_of(protocol, CONF_VOLTAGE)): (
+            quantity(100, 300, 0.1, "V")
+        ),
+        vol.Optional(CONF_ORDER_LIFETIME): quantity(
+            1, LONGEST_ORDER_LIFETIME, 1, "min"
+        ),
+    }
+    if _has(protocol, CONF_COMMAND):
+        form[
+            vol.Required(CONF_COMMAND, default=str(default_of(protocol, CONF_COMMAND)))
+        ] = dropdown(CONF_COMMAND, ("68", "69"))
+    if _has(protocol, CONF_INFORMATION):
+        zeros = bytes(INFORMATION_BYTES).hex()
+        form[vol.Required(CONF_INFORMATION, default=zeros)] = TextSelector()
+    if _has(protocol, CONF_PHASE_ORDER):
+        form[vol.Required(CONF_PHASE_ORDER, default=PHASE_ORDERS[0])] = dropdown(
+            CONF_PHASE_ORDER, PHASE_ORDERS
+        )
+    return vol.Schema(form)
+
+
+def _has(protocol: Protocol, name: str) -> bool:
+    return any(one.name == name for one in fields(protocol.config))
+
+
+def check_charger(typed: Mapping[str, Any]) -> Errors:
+    """Return what is wrong with a filled-in charger form.
+
+    What is in the collapsed section is reported for the whole form: nobody sees a
+    mark on a field that is folded away.
+    """
+    errors = check_currents(typed)
+    expert = typed[CONF_EXPERT]
+    if not typed[CONF_NAME].strip():
+        errors[CONF_NAME] = "name_empty"
+    numbers = (CONF_POLL_INTERVAL, CONF_VOLTAGE, CONF_ORDER_LIFETIME)
+    if not all(is_number(expert[key]) for key in numbers if key in expert):
+        errors["base"] = "expert_not_a_number"
+        return errors
+    if not _is_information(expert.get(CONF_INFORMATION)):
+        errors["base"] = "bad_information"
+    return errors | check_timeout(typed, expert[CONF_POLL_INTERVAL])
+
+
+def _is_information(text: str | None) -> bool:
+    if text is None:
+        return True
+    try:
+        return len(bytes.fromhex(text)) == INFORMATION_BYTES
+    except ValueError:
+        return False
+
+
+# -- What is stored --------------------------------------------------------------
+
+
+def charger_data(
+    address: int, serial: str | None, typed: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return a subentry's data of a filled-in and checked charger form."""
+    expert = typed[CONF_EXPERT]
+    data: dict[str, Any] = {
+        CONF_ADDRESS: address,
+        CONF_SERIAL: serial,
+        CONF_INSTALLATION_LIMIT: typed[CONF_INSTALLATION_LIMIT],
+        CONF_VOLTAGE: expert[CONF_VOLTAGE],
+        CONF_POLL_INTERVAL: expert[CONF_POLL_INTERVAL],
+        CONF_ORDER_LIFETIME: expert.get(CONF_ORDER_LIFETIME),
+    }
+    if CONF_FAIL_SAFE_CURRENT in typed:
+        data[CONF_FAIL_SAFE_CURRENT] = typed[CONF_FAIL_SAFE_CURRENT]
+    if CONF_FAIL_SAFE_TIMEOUT in typed:
+        data[CONF_FAIL_SAFE_TIMEOUT] = int(typed[CONF_FAIL_SAFE_TIMEOUT])
+    if CONF_COMMAND in expert:
+        data[CONF_COMMAND] = int(expert[CONF_COMMAND])
+    if CONF_INFORMATION in expert:
+        data[CONF_INFORMATION] = bytes.fromhex(expert[CONF_INFORMATION]).hex().upper()
+    if CONF_PHASE_ORDER in expert:
+        data[CONF_PHASE_ORDER] = [int(one) for one in expert[CONF_PHASE_ORDER]]
+    return data
+
+
+def charger_suggestions(protocol: Protocol, subentry: ConfigSubentry) -> dict[str, Any]:
+    """Return what is stored of a charger as the form shows it."""
+    stored = subentry.data
+    address = ADDRESSES[protocol.key]
+    expert = {
+        key: stored[key]
+        for key in (CONF_VOLTAGE, CONF_POLL_INTERVAL, CONF_ORDER_LIFETIME)
+        if stored.get(key) is not None
+    }
+    if CONF_COMMAND in stored:
+        expert[CONF_COMMAND] = str(stored[CONF_COMMAND])
+    if CONF_INFORMATION in stored:
+        expert[CONF_INFORMATION] = stored[CONF_INFORMATION]
+    if CONF_PHASE_ORDER in stored:
+        expert[CONF_PHASE_ORDER] = "".join(map(str, stored[CONF_PHASE_ORDER]))
+    suggestions = {
+        CONF_NAME: subentry.title,
+        address.one: address.show(stored[CONF_ADDRESS]),
+        CONF_INSTALLATION_LIMIT: stored[CONF_INSTALLATION_LIMIT],
+        CONF_EXPERT: expert,
+    }
+    if stored.get(CONF_SERIAL) is not None:
+        suggestions[CONF_SERIAL] = stored[CONF_SERIAL]
+    return suggestions

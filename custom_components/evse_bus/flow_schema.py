@@ -1,0 +1,397 @@
+"""The forms for a bus and for the search: asked, refused, stored. Pure.
+
+A form's texts stand in ``translations/en.json``.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, Final
+
+from homeassistant.const import CONF_DEVICE
+from homeassistant.data_entry_flow import section
+from homeassistant.helpers.selector import (
+    BooleanSelector,
+    NumberSelector,
+    NumberSelectorConfig,
+    NumberSelectorMode,
+    SelectOptionDict,
+    Selector,
+    SelectSelector,
+    SelectSelectorConfig,
+    SelectSelectorMode,
+    SerialPortSelector,
+    TextSelector,
+    TextSelectorConfig,
+)
+import probatio as vol
+
+from .const import (
+    CONF_BAUDRATE,
+    CONF_FAIL_SAFE_CURRENT,
+    CONF_FAIL_SAFE_TIMEOUT,
+    CONF_INSTALLATION_LIMIT,
+    CONF_PARITY,
+    CONF_POLL_INTERVAL,
+    CONF_PROTOCOL,
+    CONF_STOP_BITS,
+)
+from .evse.model import MAXIMUM_CURRENT, MINIMUM_CURRENT, RefusedOrderError
+from .evse.protocols import PROTOCOLS
+from .evse.safety import MAXIMUM_TIMEOUT, number
+
+if TYPE_CHECKING:
+    from .evse.framing import LineSettings
+    from .evse.model import FoundCharger
+    from .evse.protocol import Protocol
+
+# Keys of the forms that are stored under another name, or not at all.
+CONF_LINE: Final = "line"
+CONF_CHARGERS: Final = "chargers"
+CONF_CONFIRM: Final = "confirm"
+CONF_SEARCH_CURRENT: Final = "search_current"
+
+SUGGESTED_LIMIT: Final = 16.0
+"""Offered, never taken unseen: the user confirms what the wiring may carry, A."""
+DEFAULT_FAIL_SAFE_TIMEOUT: Final = 60
+INTERVALS_PER_TIMEOUT: Final = 3
+"""A time-out must outlast this many polls, or one lost answer sets it off."""
+
+type Errors = dict[str, str]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AddressForm:
+    """How people name a place on a protocol's bus."""
+
+    one: str
+    """Key of the form's field for one address."""
+    many: str
+    """Key of the field for several."""
+    error: str
+    """Said of anything that is no such address."""
+    lowest: int
+    highest: int
+    any: int | None = None
+    """Address that every box answers to, for a box that is alone on its line."""
+    is_serial: bool = False
+    """The address is the serial number."""
+    digits: int = 1
+
+    def parse(self, text: object) -> int:
+        """Return a typed address; raises ValueError when it is none."""
+        typed = str(text).strip()
+        if not typed.isdecimal() or not typed.isascii():
+            raise ValueError(typed)
+        if not self.lowest <= (address := int(typed)) <= self.highest:
+            raise ValueError(typed)
+        return address
+
+    def show(self, address: int) -> str:
+        """Return an address as people read it on the box."""
+        return f"{address:0{self.digits}d}"
+
+    def serial(self, address: int) -> str | None:
+        """Return the serial number that an address tells."""
+        if not self.is_serial or address == self.any:
+            return None
+        return self.show(address)
+
+    @property
+    def selector(self) -> Selector[Any]:
+        """Return the field for one address."""
+        if self.is_serial:
+            return TextSelector()
+        return SelectSelector(self._choice(multiple=False))
+
+    @property
+    def selector_many(self) -> Selector[Any]:
+        """Return the field for several."""
+        if self.is_serial:
+            return TextSelector(TextSelectorConfig(multiple=True))
+        return SelectSelector(self._choice(multiple=True))
+
+    def _choice(self, *, multiple: bool) -> SelectSelectorConfig:
+        return SelectSelectorConfig(
+            options=[str(one) for one in range(self.lowest, self.highest + 1)],
+            multiple=multiple,
+            mode=SelectSelectorMode.DROPDOWN,
+        )
+
+
+ADDRESSES: Final[Mapping[str, AddressForm]] = {
+    "evbox": AddressForm(
+        one="serial_number",
+        many="serial_numbers",
+        error="bad_serial_number",
+        lowest=0,
+        highest=99_999_999,
+        any=0,
+        is_serial=True,
+        digits=8,
+    ),
+    "abl": AddressForm(
+        one="device_id",
+        many="device_ids",
+        error="bad_device_id",
+        lowest=1,
+        highest=16,
+    ),
+}
+
+
+# -- Fields ----------------------------------------------------------------------
+
+
+def amperes(lowest: float = 0) -> NumberSelector:
+    """Return a field for a current, A."""
+    return quantity(lowest, MAXIMUM_CURRENT, 0.1, "A")
+
+
+def quantity(lowest: float, highest: float, step: float, unit: str) -> NumberSelector:
+    """Return a field for a number to be typed."""
+    return NumberSelector(
+        NumberSelectorConfig(
+            min=lowest,
+            max=highest,
+            step=step,
+            unit_of_measurement=unit,
+            mode=NumberSelectorMode.BOX,
+        )
+    )
+
+
+def dropdown(key: str, options: Iterable[str]) -> SelectSelector:
+    """Return a field to choose from; its texts stand under ``selector.<key>``."""
+    return SelectSelector(
+        SelectSelectorConfig(
+            options=list(options),
+            translation_key=key,
+            mode=SelectSelectorMode.DROPDOWN,
+        )
+    )
+
+
+def suggest(key: str, value: object) -> vol.Required:
+    """Return the key of a field that is filled in, but not taken unseen."""
+    return vol.Required(key, description={"suggested_value": value})
+
+
+def default_of(protocol: Protocol, name: str) -> Any:  # noqa: ANN401 - any field's
+    """Return what a protocol sets up a charger with, unless told otherwise."""
+    return next(one.default for one in fields(protocol.config) if one.name == name)
+
+
+# -- Checks that several forms share ---------------------------------------------
+
+
+def is_number(value: object) -> bool:
+    """Return whether a value is a finite number from 0.
+
+    The number field lets NaN through every range.
+    """
+    try:
+        number(value)
+    except RefusedOrderError:
+        return False
+    return True
+
+
+def check_currents(typed: Mapping[str, Any]) -> Errors:
+    """Return what is wrong with the currents of a form."""
+    keys = [CONF_INSTALLATION_LIMIT, CONF_SEARCH_CURRENT, CONF_FAIL_SAFE_CURRENT]
+    errors = {
+        key: "not_a_number"
+        for key in keys
+        if key in typed and not is_number(typed[key])
+    }
+    if errors:
+        return errors
+    limit = typed[CONF_INSTALLATION_LIMIT]
+    return {
+        key: "above_installation_limit" for key in keys if typed.get(key, 0) > limit
+    }
+
+
+def check_timeout(typed: Mapping[str, Any], poll_interval: float) -> Errors:
+    """Return what is wrong with the fail-safe time-out of a form, if it has one."""
+    if (timeout := typed.get(CONF_FAIL_SAFE_TIMEOUT)) is None:
+        return {}
+    if not is_number(timeout):
+        return {CONF_FAIL_SAFE_TIMEOUT: "not_a_number"}
+    if timeout < INTERVALS_PER_TIMEOUT * poll_interval:
+        return {CONF_FAIL_SAFE_TIMEOUT: "timeout_too_short"}
+    return {}
+
+
+# -- The bus ---------------------------------------------------------------------
+
+
+def protocol_form() -> vol.Schema:
+    """Ask which language the chargers speak."""
+    return vol.Schema(
+        {
+            vol.Required(CONF_PROTOCOL): SelectSelector(
+                SelectSelectorConfig(
+                    options=list(PROTOCOLS),
+                    translation_key=CONF_PROTOCOL,
+                    mode=SelectSelectorMode.LIST,
+                )
+            )
+        }
+    )
+
+
+def port_form(usual: LineSettings) -> vol.Schema:
+    """Ask for the port; experts may say how bytes look on the wire."""
+    line = {
+        vol.Required(CONF_BAUDRATE, default=usual.baudrate): quantity(
+            300, 921_600, 1, "Bd"
+        ),
+        vol.Required(CONF_PARITY, default=usual.parity.lower()): dropdown(
+            CONF_PARITY, ("n", "e", "o")
+        ),
+        vol.Required(CONF_STOP_BITS, default=str(usual.stop_bits)): dropdown(
+            CONF_STOP_BITS, ("1", "2")
+        ),
+    }
+    return vol.Schema(
+        {
+            vol.Required(CONF_DEVICE): SerialPortSelector(),
+            vol.Required(CONF_LINE): section(vol.Schema(line), {"collapsed": True}),
+        }
+    )
+
+
+def port_suggestions(data: Mapping[str, Any], settings: LineSettings) -> dict[str, Any]:
+    """Return what is stored of a bus as the port form shows it."""
+    return {
+        CONF_DEVICE: data[CONF_DEVICE],
+        CONF_LINE: {
+            CONF_BAUDRATE: settings.baudrate,
+            CONF_PARITY: settings.parity.lower(),
+            CONF_STOP_BITS: str(settings.stop_bits),
+        },
+    }
+
+
+def bus_data(protocol: Protocol, typed: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an entry's data of a filled-in port form: overrides where they differ.
+
+    Raises RefusedOrderError for a baud rate that is no number.
+    """
+    line = typed[CONF_LINE]
+    wanted = {
+        CONF_BAUDRATE: int(number(line[CONF_BAUDRATE], CONF_BAUDRATE)),
+        CONF_PARITY: line[CONF_PARITY].upper(),
+        CONF_STOP_BITS: int(line[CONF_STOP_BITS]),
+    }
+    usual = {
+        CONF_BAUDRATE: protocol.settings.baudrate,
+        CONF_PARITY: protocol.settings.parity,
+        CONF_STOP_BITS: protocol.settings.stop_bits,
+    }
+    return {
+        CONF_PROTOCOL: protocol.key,
+        CONF_DEVICE: typed[CONF_DEVICE].strip(),
+        **{key: value for key, value in wanted.items() if value != usual[key]},
+    }
+
+
+# -- The search ------------------------------------------------------------------
+
+
+def impose_form(protocol: Protocol, *, ask_addresses: bool) -> vol.Schema:
+    """Ask for all that a search sets, where every message sets limits."""
+    address = ADDRESSES[protocol.key]
+    form: dict[vol.Marker, object] = {}
+    if ask_addresses:
+        form[vol.Required(address.many)] = address.selector_many
+    return vol.Schema(
+        form
+        | {
+            suggest(CONF_INSTALLATION_LIMIT, SUGGESTED_LIMIT): amperes(MINIMUM_CURRENT),
+            vol.Required(CONF_SEARCH_CURRENT, default=MINIMUM_CURRENT): amperes(),
+            vol.Required(CONF_FAIL_SAFE_CURRENT, default=MINIMUM_CURRENT): amperes(),
+            vol.Required(
+                CONF_FAIL_SAFE_TIMEOUT, default=DEFAULT_FAIL_SAFE_TIMEOUT
+            ): quantity(1, MAXIMUM_TIMEOUT, 1, "s"),
+            vol.Required(CONF_CONFIRM, default=False): BooleanSelector(),
+        }
+    )
+
+
+def check_impose(protocol: Protocol, typed: Mapping[str, Any]) -> Errors:
+    """Return what is wrong with the values that a search would set."""
+    errors = check_currents(typed)
+    if not errors and 0 < typed[CONF_SEARCH_CURRENT] < MINIMUM_CURRENT:
+        errors[CONF_SEARCH_CURRENT] = "below_minimum"
+    errors |= check_timeout(typed, default_of(protocol, CONF_POLL_INTERVAL))
+    if not typed[CONF_CONFIRM]:
+        errors[CONF_CONFIRM] = "not_confirmed"
+    return errors
+
+
+def found_form(options: list[SelectOptionDict], *, multiple: bool) -> vol.Schema:
+    """Ask which of the chargers found to add, and what their wiring may carry."""
+    every = [option["value"] for option in options]
+    chosen: vol.Marker = (
+        vol.Required(CONF_CHARGERS, default=every)
+        if multiple
+        else vol.Required(CONF_CHARGERS, default=every[0])
+    )
+    config = SelectSelectorConfig(
+        options=options, multiple=multiple, mode=SelectSelectorMode.LIST
+    )
+    return vol.Schema(
+        {
+            chosen: SelectSelector(config),
+            suggest(CONF_INSTALLATION_LIMIT, SUGGESTED_LIMIT): amperes(MINIMUM_CURRENT),
+        }
+    )
+
+
+def found_options(
+    protocol: Protocol, found: Iterable[FoundCharger]
+) -> list[SelectOptionDict]:
+    """Return the chargers found as a list to choose from."""
+    show = ADDRESSES[protocol.key].show
+    return [
+        SelectOptionDict(
+            value=str(one.address),
+            label=f"{show(one.address)}: {one.info.manufacturer} {one.info.model}"
+            + (f" ({one.serial})" if one.serial else ""),
+        )
+        for one in found
+    ]
+
+
+def manual_form(protocol: Protocol, *, multiple: bool) -> vol.Schema:
+    """Ask where the chargers are."""
+    address = ADDRESSES[protocol.key]
+    if multiple:
+        return vol.Schema({vol.Required(address.many): address.selector_many})
+    return vol.Schema({vol.Required(address.one): address.selector})
+
+
+def typed_addresses(
+    protocol: Protocol, typed: Mapping[str, Any], taken: Iterable[int] = ()
+) -> tuple[list[int], Errors]:
+    """Return the addresses typed into a form, and what is wrong with them."""
+    form = ADDRESSES[protocol.key]
+    key = form.many if form.many in typed else form.one
+    texts = typed[key] if form.many in typed else [typed[key]]
+    try:
+        addresses = [form.parse(text) for text in texts if str(text).strip()]
+    except ValueError:
+        return [], {key: form.error}
+    taken = set(taken)
+    if not addresses:
+        return [], {key: "no_address"}
+    if len(set(addresses)) < len(addresses):
+        return [], {key: "address_twice"}
+    if taken.intersection(addresses):
+        return [], {key: "address_taken"}
+    everyone = taken.union(addresses)
+    if form.any in everyone and len(everyone) > 1:
+        return [], {key: "any_not_alone"}
+    return addresses, {}

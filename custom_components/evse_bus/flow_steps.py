@@ -1,0 +1,335 @@
+"""Steps that adding a bus and adding a charger share: search, name, confirm."""
+
+from abc import abstractmethod
+import asyncio
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from homeassistant.config_entries import ConfigSubentryData
+from homeassistant.const import CONF_DEVICE, CONF_NAME
+from homeassistant.data_entry_flow import FlowContext, FlowHandler, FlowResult
+
+from .const import (
+    CONF_FAIL_SAFE_CURRENT,
+    CONF_FAIL_SAFE_TIMEOUT,
+    CONF_INSTALLATION_LIMIT,
+    SUBENTRY_CHARGER,
+)
+from .evse.model import ScanReport
+from .flow_charger import (
+    Candidate,
+    charger_data,
+    charger_form,
+    check_charger,
+    default_name,
+)
+from .flow_scan import error_key
+from .flow_schema import (
+    ADDRESSES,
+    CONF_CHARGERS,
+    Errors,
+    check_currents,
+    found_form,
+    found_options,
+    manual_form,
+    typed_addresses,
+)
+from .setup import charger_unique_id, line_settings
+
+if TYPE_CHECKING:
+    from .evse.model import FoundCharger
+    from .evse.protocol import Progress, Protocol
+
+
+class ChargerSteps[
+    ContextT: FlowContext,
+    ResultT: FlowResult[Any, Any],
+    HandlerT,
+](FlowHandler[ContextT, ResultT, HandlerT]):
+    """From a bus to chargers that are ready to be stored."""
+
+    several: ClassVar[bool]
+    """More than one charger can be added at once."""
+    step_after_error: ClassVar[str]
+    """Where one goes when it could not be made; shows `take_error`."""
+
+    def __init__(self) -> None:
+        """Start with nothing found."""
+        super().__init__()
+        self.protocol: Protocol
+        self.bus_data: dict[str, Any]
+        """Data of the bus's entry."""
+        self.suggestions: dict[str, Any] = {}
+        """Values typed so far that the next forms offer again."""
+        self._scan_task: asyncio.Task[ScanReport] | None = None
+        self._report = ScanReport()
+        self._error: str | None = None
+        self._pending: list[Candidate] = []
+        self._ready: list[ConfigSubentryData] = []
+
+    # -- What the two flows do differently ---------------------------------------
+
+    @abstractmethod
+    async def async_scan(self, progress: Progress) -> ScanReport:
+        """Search the bus; leave no port open that was not open before."""
+
+    @abstractmethod
+    def finish(self, chargers: list[ConfigSubentryData]) -> ResultT:
+        """Store the chargers."""
+
+    def choices(self) -> tuple[str, ...]:
+        """Return where one can go when a search brought nothing to add."""
+        return ("scan", "manual")
+
+    def taken(self) -> dict[int, str | None]:
+        """Return addresses and unique ids of the chargers the bus has."""
+        return {}
+
+    # -- Search ------------------------------------------------------------------
+
+    async def async_step_scan(
+        self,
+        user_input: dict[str, Any] | None = None,  # noqa: ARG002 - a step's signature
+    ) -> ResultT:
+        """Search, and show how far it is."""
+        if self._scan_task is None:
+            # The flow manager cancels it when the flow is closed.
+            self._scan_task = self.hass.async_create_background_task(
+                self.async_scan(self.async_update_progress), "evse_bus search"
+            )
+        if not self._scan_task.done():
+            return self.async_show_progress(
+                step_id="scan",
+                progress_action=f"scan_{self.protocol.key}",
+                description_placeholders=self.placeholders(),
+                progress_task=self._scan_task,
+            )
+        task, self._scan_task = self._scan_task, None
+        if isinstance(error := task.exception(), Exception):
+            self._error = error_key(error)
+            return self.async_show_progress_done(next_step_id=self.step_after_error)
+        self._report = task.result()
+        return self.async_show_progress_done(next_step_id=self._step_after_scan())
+
+    def _step_after_scan(self) -> str:
+        if self._report.duplicates:
+            return "duplicates"
+        if self._new():
+            return "select"
+        if self._report.found:
+            return "nothing_new"
+        return "unreadable" if self._report.unreadable else "nothing_found"
+
+    def _new(self) -> list[FoundCharger]:
+        taken = self.taken()
+        return [one for one in self._report.found if one.address not in taken]
+
+    def take_error(self) -> Errors:
+        """Return what went wrong before this form, once."""
+        error, self._error = self._error, None
+        return {"base": error} if error else {}
+
+    async def async_step_nothing_found(
+        self,
+        user_input: dict[str, Any] | None = None,  # noqa: ARG002
+    ) -> ResultT:
+        """Say that nobody answered, and what to try."""
+        return self._menu("nothing_found")
+
+    async def async_step_nothing_new(
+        self,
+        user_input: dict[str, Any] | None = None,  # noqa: ARG002
+    ) -> ResultT:
+        """Say that only chargers answered that are there already."""
+        return self._menu("nothing_new")
+
+    async def async_step_unreadable(
+        self,
+        user_input: dict[str, Any] | None = None,  # noqa: ARG002
+    ) -> ResultT:
+        """Say that something answered that makes no sense."""
+        return self._menu("unreadable")
+
+    async def async_step_duplicates(
+        self,
+        user_input: dict[str, Any] | None = None,  # noqa: ARG002
+    ) -> ResultT:
+        """Say that several chargers answer at one address."""
+        show = ADDRESSES[self.protocol.key].show
+        addresses = ", ".join(show(one) for one in self._report.duplicates)
+        first = ("select",) if self._new() else ()
+        return self._menu("duplicates", first, addresses=addresses)
+
+    def _menu(
+        self, step_id: str, first: tuple[str, ...] = (), **placeholders: str
+    ) -> ResultT:
+        return self.async_show_menu(
+            step_id=step_id,
+            menu_options=[*first, *self.choices()],
+            description_placeholders=self.placeholders() | placeholders,
+        )
+
+    def placeholders(self) -> dict[str, str]:
+        """Return what texts may name of the bus."""
+        return {
+            "port": self.bus_data[CONF_DEVICE],
+            "protocol": self.protocol.name,
+            "settings": str(line_settings(self.bus_data)),
+        }
+
+    # -- Which chargers ----------------------------------------------------------
+
+    async def async_step_select(
+        self, user_input: dict[str, Any] | None = None
+    ) -> ResultT:
+        """Choose from what was found."""
+        found = self._new()
+        errors: Errors = {}
+        if user_input is not None:
+            chosen = user_input[CONF_CHARGERS]
+            errors = check_currents(user_input)
+            if not chosen:
+                errors[CONF_CHARGERS] = "nothing_chosen"
+            if not errors:
+                limit = user_input[CONF_INSTALLATION_LIMIT]
+                self.suggestions[CONF_INSTALLATION_LIMIT] = limit
+                wanted = {chosen} if isinstance(chosen, str) else set(chosen)
+                return await self.async_begin(
+                    Candidate(address=one.address, found=one)
+                    for one in found
+                    if str(one.address) in wanted
+                )
+        form = found_form(found_options(self.protocol, found), multiple=self.several)
+        return self.async_show_form(
+            step_id="select",
+            data_schema=self.add_suggested_values_to_schema(
+                form, self.suggestions | (user_input or {})
+            ),
+            errors=errors,
+            description_placeholders=self.placeholders(),
+        )
+
+    async def async_step_manual(
+        self, user_input: dict[str, Any] | None = None
+    ) -> ResultT:
+        """Type where the chargers are."""
+        errors = self.take_error()
+        if user_input is not None:
+            addresses, errors = typed_addresses(self.protocol, user_input, self.taken())
+            if not errors:
+                told = {one.address: one for one in self._report.found}
+                return await self.async_begin(
+                    Candidate(address=address, found=told.get(address))
+                    for address in addresses
+                )
+        return self.async_show_form(
+            step_id="manual",
+            data_schema=self.add_suggested_values_to_schema(
+                manual_form(self.protocol, multiple=self.several), user_input
+            ),
+            errors=errors,
+            description_placeholders=self.placeholders(),
+        )
+
+    # -- One charger after the other ---------------------------------------------
+
+    async def async_begin(self, candidates: Iterable[Candidate]) -> ResultT:
+        """Ask for the first charger's name and limits."""
+        self._pending = list(candidates)
+        self._ready = []
+        return await self.async_step_charger()
+
+    async def async_step_charger(
+        self, user_input: dict[str, Any] | None = None
+    ) -> ResultT:
+        """Ask for one charger's name and limits; again for the next."""
+        errors: Errors = {}
+        if user_input is not None:
+            errors = self._take_charger(self._pending[0], user_input)
+            if not errors:
+                self._pending.pop(0)
+                user_input = None
+                if not self._pending:
+                    return self._confirm()
+        candidate = self._pending[0]
+        address = ADDRESSES[self.protocol.key]
+        offered = {
+            CONF_NAME: default_name(self.protocol, candidate.address),
+            address.one: address.show(candidate.address),
+            **self.suggestions,
+        }
+        return self.async_show_form(
+            step_id="charger",
+            data_schema=self.add_suggested_values_to_schema(
+                charger_form(
+                    self.protocol, ask_address=candidate.address == address.any
+                ),
+                user_input or offered,
+            ),
+            errors=errors,
+            description_placeholders=self.placeholders()
+            | candidate.placeholders(self.protocol)
+            | {
+                "number": str(len(self._ready) + 1),
+                "total": str(len(self._ready) + len(self._pending)),
+            },
+        )
+
+    def _take_charger(self, candidate: Candidate, typed: dict[str, Any]) -> Errors:
+        errors = check_charger(typed)
+        if ADDRESSES[self.protocol.key].one in typed:
+            # Found without its serial number: here it can be given.
+            addresses, wrong = typed_addresses(self.protocol, typed, self.taken())
+            errors |= wrong
+            if addresses:
+                candidate = Candidate(address=addresses[0])
+        serial = candidate.serial(self.protocol)
+        identity = charger_unique_id(self.protocol.key, serial, candidate.address)
+        if identity in self.taken().values():
+            errors["base"] = "already_configured"
+        if not errors:
+            self._ready.append(
+                ConfigSubentryData(
+                    data=charger_data(candidate.address, serial, typed),
+                    subentry_type=SUBENTRY_CHARGER,
+                    title=typed[CONF_NAME].strip(),
+                    unique_id=identity,
+                )
+            )
+        return errors
+
+    # -- What happens when we fall silent ----------------------------------------
+
+    def _confirm(self) -> ResultT:
+        address = ADDRESSES[self.protocol.key]
+        rows = []
+        for one in self._ready:
+            data = one["data"]
+            cells = [
+                one["title"].replace("|", "/"),
+                address.show(data["address"]),
+                f"{data[CONF_INSTALLATION_LIMIT]:g} A",
+                f"{data[CONF_FAIL_SAFE_CURRENT]:g} A",
+            ]
+            if CONF_FAIL_SAFE_TIMEOUT in data:
+                cells.append(f"{data[CONF_FAIL_SAFE_TIMEOUT]} s")
+            rows.append(f"| {' | '.join(cells)} |")
+        return self.async_show_form(
+            step_id=f"confirm_{self.protocol.key}",
+            description_placeholders={"chargers": "\n".join(rows)},
+            last_step=True,
+        )
+
+    async def async_step_confirm_evbox(
+        self,
+        user_input: dict[str, Any] | None = None,  # noqa: ARG002
+    ) -> ResultT:
+        """Store, now that the user knows an EVBox's fail-safe."""
+        return self.finish(self._ready)
+
+    async def async_step_confirm_abl(
+        self,
+        user_input: dict[str, Any] | None = None,  # noqa: ARG002
+    ) -> ResultT:
+        """Store, now that the user knows that an ABL box has none."""
+        return self.finish(self._ready)

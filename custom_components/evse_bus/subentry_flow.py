@@ -1,0 +1,152 @@
+"""Add one charger to a bus that is set up, or change its set-up."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, override
+
+from homeassistant.config_entries import (
+    ConfigEntryState,
+    ConfigSubentryData,
+    ConfigSubentryFlow,
+    SubentryFlowContext,
+    SubentryFlowResult,
+)
+from homeassistant.const import CONF_ADDRESS, CONF_NAME
+
+from .const import (
+    CONF_FAIL_SAFE_CURRENT,
+    CONF_FAIL_SAFE_TIMEOUT,
+    CONF_INSTALLATION_LIMIT,
+    CONF_SERIAL,
+    SUBENTRY_CHARGER,
+)
+from .evse.model import NotAvailableError, ScanReport
+from .flow_charger import (
+    charger_data,
+    charger_form,
+    charger_suggestions,
+    check_charger,
+)
+from .flow_scan import async_search, nothing_imposed
+from .flow_schema import ADDRESSES, Errors, typed_addresses
+from .flow_steps import ChargerSteps
+from .setup import charger_unique_id, protocol_of
+
+if TYPE_CHECKING:
+    from .coordinator import EvseBusConfigEntry
+    from .evse.protocol import Progress
+
+
+class ChargerSubentryFlow(
+    ChargerSteps[SubentryFlowContext, SubentryFlowResult, tuple[str, str]],
+    ConfigSubentryFlow,
+):
+    """Add or change one charger."""
+
+    several = False
+    step_after_error = "manual"
+
+    @override
+    def taken(self) -> dict[int, str | None]:
+        """Return the other chargers of the bus."""
+        own = self.context.get("subentry_id")
+        return {
+            one.data[CONF_ADDRESS]: one.unique_id
+            for one in self._get_entry().get_subentries_of_type(SUBENTRY_CHARGER)
+            if one.subentry_id != own
+        }
+
+    async def async_step_user(
+        self,
+        user_input: dict[str, Any] | None = None,  # noqa: ARG002 - a step's signature
+    ) -> SubentryFlowResult:
+        """Choose how to find the charger."""
+        entry = self._get_entry()
+        self.protocol = protocol_of(entry.data)
+        self.bus_data = dict(entry.data)
+        # A search that sets limits is left to the charger's own first turn; and
+        # the address that every box answers to is not for a bus with others on it.
+        searchable = not self.protocol.probe_imposes
+        if not searchable or entry.state is not ConfigEntryState.LOADED:
+            return await self.async_step_manual()
+        return self.async_show_menu(
+            step_id="user",
+            menu_options=list(self.choices()),
+            description_placeholders=self.placeholders(),
+        )
+
+    @override
+    async def async_scan(self, progress: Progress) -> ScanReport:
+        """Search between the turns of the chargers that are running."""
+        entry: EvseBusConfigEntry = self._get_entry()
+        if entry.state is not ConfigEntryState.LOADED:
+            raise NotAvailableError(entry.title)
+        searches = nothing_imposed(self.protocol)
+        bus = entry.runtime_data.bus
+        return await async_search(self.protocol, bus, searches, progress)
+
+    @override
+    def finish(self, chargers: list[ConfigSubentryData]) -> SubentryFlowResult:
+        """Create the charger."""
+        [charger] = chargers
+        return self.async_create_entry(
+            title=charger["title"],
+            data=charger["data"],
+            unique_id=charger["unique_id"],
+        )
+
+    # -- Later -------------------------------------------------------------------
+
+    async def async_step_reconfigure(
+        self, user_input: dict[str, Any] | None = None
+    ) -> SubentryFlowResult:
+        """Change a charger's set-up, or where and who it is."""
+        entry = self._get_entry()
+        subentry = self._get_reconfigure_subentry()
+        self.protocol = protocol_of(entry.data)
+        errors: Errors = {}
+        if user_input is not None:
+            addresses, errors = typed_addresses(self.protocol, user_input, self.taken())
+            errors |= check_charger(user_input)
+            if not errors:
+                [address] = addresses
+                serial = self._serial(address, user_input)
+                identity = charger_unique_id(self.protocol.key, serial, address)
+                if identity not in self.taken().values():
+                    data = charger_data(address, serial, user_input)
+                    return self.async_update_and_abort(
+                        entry,
+                        subentry,
+                        unique_id=identity,
+                        title=user_input[CONF_NAME].strip(),
+                        data=data | _fail_safe(subentry.data, data),
+                    )
+                errors["base"] = "already_configured"
+        return self.async_show_form(
+            step_id="reconfigure",
+            data_schema=self.add_suggested_values_to_schema(
+                charger_form(self.protocol, ask_address=True, new=False),
+                user_input or charger_suggestions(self.protocol, subentry),
+            ),
+            errors=errors,
+            description_placeholders={"name": subentry.title},
+        )
+
+    def _serial(self, address: int, typed: dict[str, Any]) -> str | None:
+        form = ADDRESSES[self.protocol.key]
+        if form.is_serial:
+            return form.serial(address)
+        return typed.get(CONF_SERIAL, "").strip() or None
+
+
+def _fail_safe(stored: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fail-safe values first confirmed, within the new limit."""
+    kept = {
+        key: stored[key]
+        for key in (CONF_FAIL_SAFE_CURRENT, CONF_FAIL_SAFE_TIMEOUT)
+        if key in stored
+    }
+    if CONF_FAIL_SAFE_CURRENT in kept:
+        kept[CONF_FAIL_SAFE_CURRENT] = min(
+            kept[CONF_FAIL_SAFE_CURRENT], new[CONF_INSTALLATION_LIMIT]
+        )
+    return kept
