@@ -6,6 +6,7 @@ import math
 import random
 from typing import TYPE_CHECKING
 
+from .device import REPEAT_GAP
 from .faults import Faults
 from .log import CLIENT, INJECTED, NOISE, Entry, TrafficLog
 from .loop import LoopThread
@@ -289,9 +290,9 @@ class VirtualBus(LoopThread):
     def send_at(self, device: Device, data: bytes, at: float) -> None:
         """Send at that time, whatever else is on the wire."""
         if at <= self.time():
-            self.wire.send(device.name, data, self.time())
-            return
-        self.loop.call_at(at, self._send_due, device, data)
+            self._send_due(device, data)
+        else:
+            self.loop.call_at(at, self._send_due, device, data)
 
     def send_after_silence(
         self, device: Device, data: bytes, at: float, silence: float
@@ -360,8 +361,11 @@ class VirtualBus(LoopThread):
             device.step()
 
     def _send_due(self, device: Device, data: bytes) -> None:
-        if device.bus is self:
-            self.wire.send(device.name, data, self.time())
+        if device.bus is not self:
+            return
+        # However late our timers are: nobody talks over himself.
+        free_at = self.wire.free_from(device.name) + REPEAT_GAP
+        self.wire.send(device.name, data, max(self.time(), free_at))
 
     def _to_client(self, data: bytes) -> None:
         if self._port is not None:

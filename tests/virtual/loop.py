@@ -101,11 +101,12 @@ class LoopThread:
         loop, thread = self._loop, self._thread
         if loop is None or thread is None:
             return
-        self._loop = None
-        self._thread = None
         with contextlib.suppress(RuntimeError):
             loop.call_soon_threadsafe(loop.stop)
+        # Until it has really ended, what is due there may still need the loop.
         thread.join(CALL_TIMEOUT)
+        self._loop = None
+        self._thread = None
         for waiter in self._waiters:
             if not waiter.future.done():
                 waiter.future.set_exception(RuntimeError("the virtual bus stopped"))

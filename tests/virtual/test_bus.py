@@ -35,8 +35,8 @@ def test_nothing_is_faster_than_the_wire() -> None:
             took.append(time.monotonic() - begin)
         wire = (len(READ_FULL) + len(ANSWER)) * E1_BYTE + 0.002
         assert min(took) >= wire
-        # The best of five: others use this machine too.
-        assert min(took) < wire + 0.005
+        # Others use this machine too: the schedule is exact, its keeping is not.
+        assert min(took) < wire + 0.1
         request, reply = bus.log.entries[-2:]
         assert request.end - request.t == pytest.approx(17 * E1_BYTE)
         assert reply.t - request.end >= 0.002
@@ -60,12 +60,14 @@ def test_a_reply_comes_in_pieces_at_the_wires_pace() -> None:
 
 def test_a_client_that_talks_into_a_reply_garbles_both() -> None:
     box = AblBox(1)
-    with VirtualBus.pty(box) as bus, RawClient(bus.url, "E") as client:
+    # Slow, so that a busy machine still hits the middle of the reply.
+    slow = VirtualBus.pty(box, baud=1200, parity="E")
+    with slow as bus, RawClient(bus.url, "E") as client:
         client.write(READ_FULL)
         first = client.read(8)
         client.write(READ_FULL)
         bus.wait_for(lambda: len(bus.log) == 3)
-        rest = client.read(40, 0.05)
+        rest = client.read(40, 0.1)
         assert first + rest != ANSWER
         assert box.requests == 1
         reply, second = bus.log.entries[1:]

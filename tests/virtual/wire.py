@@ -108,6 +108,11 @@ class Wire:
         """Return when everything on the wire, or due to be, is over."""
         return max([self._last_end, *(t.end for t in self._active)])
 
+    def free_from(self, source: str) -> float:
+        """Return when the last transmission of one sender is over."""
+        ends = (t.end for t in self._active if t.source == source)
+        return max(ends, default=float("-inf"))
+
     def audible_until(self, now: float) -> float:
         """Return the end of what a listener knows of at `now`.
 
