@@ -1,12 +1,19 @@
 """Sensors: what chargers say, and what the bus counts."""
 
 from collections.abc import Hashable, Iterable
-from typing import Any, override
+from dataclasses import dataclass
+from math import isfinite
+from typing import Any, TypeGuard, override
 
-from homeassistant.components.sensor import RestoreSensor, SensorEntity
+from homeassistant.components.sensor import (
+    RestoreSensor,
+    SensorEntity,
+    SensorExtraStoredData,
+)
 from homeassistant.const import Platform
 from homeassistant.core import HomeAssistant
 from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
+from homeassistant.util import dt as dt_util
 
 from .coordinator import (
     STATISTICS,
@@ -15,6 +22,7 @@ from .coordinator import (
     Context,
     EvseBusConfigEntry,
 )
+from .energy import MeterTotal, SummedTotal
 from .entity import (
     BusEntity,
     ChargerEntity,
@@ -29,6 +37,7 @@ from .sensor_tables import (
     CHARGER_SENSORS,
     CHARGER_STATISTICS,
     CONNECTOR_SENSORS,
+    ENERGY,
     ESTIMATED_ENERGY,
     FAULT,
     NO_FAULT,
@@ -64,6 +73,8 @@ def _sensors(coordinator: BusCoordinator, unit: ChargerUnit) -> Iterable[SensorE
     for number in sorted(unit.numbers):
         for connector_description in supported(charger, CONNECTOR_SENSORS):
             yield ConnectorSensor(coordinator, unit, number, connector_description)
+        if Capability.ENERGY in charger.capabilities:
+            yield EnergySensor(coordinator, unit, number, ENERGY)
         if Capability.ESTIMATED_ENERGY in charger.capabilities:
             yield EstimatedEnergySensor(coordinator, unit, number, ESTIMATED_ENERGY)
 
@@ -170,32 +181,79 @@ class ConnectorSensor(ConnectorEntity, _ValueSensor):
         return None if reading is None else self._value(reading)
 
 
+class EnergySensor(ConnectorEntity, RestoreSensor):
+    """The meter's total; what another meter has counted before is left out."""
+
+    @override
+    async def async_added_to_hass(self) -> None:
+        """Go on from where the last run ended."""
+        self._total = MeterTotal()
+        self._kept_at = dt_util.utcnow()
+        data = await self.async_get_last_sensor_data()
+        extra = await self.async_get_last_extra_data()
+        state = await self.async_get_last_state()
+        if data is not None and extra is not None and state is not None:
+            offset = extra.as_dict().get("offset")
+            if is_energy(data.native_value) and is_energy(offset):
+                self._total = MeterTotal(offset=offset, total=data.native_value)
+                self._kept_at = state.last_updated
+        await super().async_added_to_hass()
+
+    @override
+    def show(self) -> Hashable:
+        """Show the total; unknown while the meter is not told."""
+        reading = self.reading
+        shown = None
+        if reading is not None and reading.energy is not None:
+            away = (dt_util.utcnow() - self._kept_at).total_seconds()
+            shown = self._total.take(reading.energy, reading.meter_generation, away)
+        self._attr_native_value = shown
+        return shown
+
+    @property
+    @override
+    def extra_restore_state_data(self) -> MeterData:
+        """Return what is kept for the next run."""
+        return MeterData(
+            self._total.total, self.native_unit_of_measurement, self._total.offset
+        )
+
+
+@dataclass
+class MeterData(SensorExtraStoredData):
+    """What is kept of a meter's total."""
+
+    offset: float
+
+    @override
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as it is stored."""
+        return {**super().as_dict(), "offset": self.offset}
+
+
 class EstimatedEnergySensor(ConnectorEntity, RestoreSensor):
     """Estimated energy: summed by the library since its start, and by us before."""
 
     @override
     async def async_added_to_hass(self) -> None:
         """Go on from where the last run ended."""
-        self._total = 0.0
-        self._counted_by: object = None
-        self._counted = 0.0
+        self._total = SummedTotal()
         last = await self.async_get_last_sensor_data()
-        if last is not None and isinstance(last.native_value, (int, float)):
-            self._total = float(last.native_value)
+        if last is not None and is_energy(last.native_value):
+            self._total = SummedTotal(total=last.native_value)
         await super().async_added_to_hass()
 
     @override
     def show(self) -> Hashable:
         """Add what came since the last look."""
-        charger = self.charger
         reading = self.reading
-        now = reading.estimated_energy if reading is not None else None
-        if now is not None:
-            if charger is not self._counted_by or now < self._counted:
-                # A charger made anew counts from 0.
-                self._counted_by = charger
-                self._counted = 0.0
-            self._total += now - self._counted
-            self._counted = now
-        self._attr_native_value = shown = round(self._total, 3)
+        summed = reading.estimated_energy if reading is not None else None
+        if summed is not None:
+            self._total.take(summed, self.charger)
+        self._attr_native_value = shown = round(self._total.total, 3)
         return shown
+
+
+def is_energy(value: object) -> TypeGuard[float]:
+    """Return whether a stored value can be used as an energy."""
+    return isinstance(value, (int, float)) and isfinite(value)

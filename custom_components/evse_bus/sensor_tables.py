@@ -167,12 +167,6 @@ CONNECTOR_SENSORS: Final[tuple[ConnectorSensorDescription, ...]] = (
         **_POWER,
     ),
     ConnectorSensorDescription(
-        key="energy",
-        capability=Capability.ENERGY,
-        value=lambda reading: reading.energy,
-        **_ENERGY,
-    ),
-    ConnectorSensorDescription(
         key="estimated_power",
         translation_key="estimated_power",
         capability=Capability.ESTIMATED_POWER,
@@ -189,6 +183,7 @@ CONNECTOR_SENSORS: Final[tuple[ConnectorSensorDescription, ...]] = (
     ),
 )
 
+ENERGY: Final = SensorEntityDescription(key="energy", **_ENERGY)
 ESTIMATED_ENERGY: Final = SensorEntityDescription(
     key="estimated_energy", translation_key="estimated_energy", **_ENERGY
 )
