@@ -70,7 +70,7 @@ class Faults:
             ("truncate", self.truncate_rate),
         ):
             if rate and replies and rng.random() < rate:
-                replies = self._do(kind, None, replies, rng)  # type: ignore[arg-type]
+                replies = self._do(kind, None, replies, rng)
         return replies
 
     def disturb(self, data: bytes, rng: Random) -> bytes:

@@ -139,7 +139,7 @@ class LoopThread:
     ) -> T:
         """Wait until the predicate is true without blocking the caller's loop."""
         future = self._wait(predicate, timeout)
-        return await asyncio.wrap_future(future)  # type: ignore[return-value]
+        return await asyncio.wrap_future(future)  # type: ignore[arg-type]
 
     def check_waiters(self) -> None:
         """Ask the predicates again (on the bus thread)."""
@@ -156,6 +156,9 @@ class LoopThread:
         future: concurrent.futures.Future[T] = concurrent.futures.Future()
 
         def run() -> None:
+            # A caller that was cancelled meanwhile no longer wants it done.
+            if not future.set_running_or_notify_cancel():
+                return
             try:
                 value = function()
             except BaseException as error:  # noqa: BLE001 - belongs to the caller

@@ -224,3 +224,14 @@ def test_frozen_time_does_not_stop_it(freezer: object) -> None:
         assert client.ask(READ_FULL) == ANSWER
         with pytest.raises(TimeoutError):
             bus.wait_for(lambda: False, timeout=0.02)
+
+
+async def test_a_cancelled_wait_leaves_nothing_behind() -> None:
+    async with VirtualBus.pty(AblBox(1)) as bus:
+        waiting = asyncio.create_task(bus.wait_for_async(lambda: bus.opened))
+        await asyncio.sleep(0.01)
+        waiting.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await waiting
+        with RawClient(bus.url):
+            await bus.wait_for_async(lambda: bus.opened)

@@ -97,7 +97,8 @@ def test_byte_errors_hit_requests_and_replies(line: Line) -> None:
     "kind", ["lose_rate", "late_rate", "duplicate_rate", "truncate_rate"]
 )
 def test_rates(kind: str) -> None:
-    faults = Faults(**{kind: 0.25})
+    faults = Faults()
+    setattr(faults, kind, 0.25)
     rng = Random(1)  # noqa: S311 - repeatable on purpose
     hit = sum(
         faults.apply([(0.0, b"abcd")], rng) != [(0.0, b"abcd")] for _ in range(400)
