@@ -1,6 +1,7 @@
 """What a protocol tells the bus about its frames and its times."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 
@@ -70,7 +71,7 @@ class Framer[F: Frame](ABC):
         """Frames with a wrong checksum, wrong length or impossible content."""
 
     @abstractmethod
-    def feed(self, data: bytes) -> list[F]:
+    def feed(self, data: bytes) -> Sequence[F]:
         """Return the whole frames that end within these bytes."""
 
     @abstractmethod

@@ -1,0 +1,65 @@
+"""One exchange with a box: a block read, a register written."""
+
+from ..exchange import Talk
+from ..model import ReplyTimeoutError
+from ..safety import Setpoint
+from .registers import (
+    CONFIGURATION_REGISTER,
+    LIMIT_REGISTER,
+    STATE_REGISTER,
+    Block,
+    StateCode,
+    read_answer,
+    read_request,
+    write_answer,
+    write_configuration,
+    write_limit,
+    write_state,
+)
+
+
+async def read(talk: Talk, address: int, block: Block, *, attempts: int = 1) -> bytes:
+    """Return the bytes of a block; raises what `Talk.exchange` raises.
+
+    More than one attempt is for a box known to be awake: then a lost answer was a
+    disturbance, and asking again at once helps.
+    """
+    request = read_request(address, block)
+    for _ in range(attempts - 1):
+        try:
+            return await talk.exchange(request, read_answer(address, block))
+        except ReplyTimeoutError:
+            continue
+    return await talk.exchange(request, read_answer(address, block))
+
+
+async def set_limit(talk: Talk, address: int, setpoint: Setpoint) -> None:
+    """Write Icmax; also raises ExchangeRefusedError."""
+    await talk.exchange(
+        write_limit(address, setpoint), write_answer(address, LIMIT_REGISTER)
+    )
+
+
+async def set_state(talk: Talk, address: int, code: StateCode) -> None:
+    """Make the outlet change its state; also raises ExchangeRefusedError."""
+    await talk.exchange(
+        write_state(address, code), write_answer(address, STATE_REGISTER)
+    )
+
+
+async def configure(
+    talk: Talk,
+    address: int,
+    device_id: int,
+    *,
+    upstream_timeout: bool | None = None,
+    needs_enable: bool | None = None,
+) -> None:
+    """Write device-ID and settings (in E2); also raises ExchangeRefusedError."""
+    request = write_configuration(
+        address,
+        device_id,
+        upstream_timeout=upstream_timeout,
+        needs_enable=needs_enable,
+    )
+    await talk.exchange(request, write_answer(address, CONFIGURATION_REGISTER))

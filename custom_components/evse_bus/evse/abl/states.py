@@ -1,0 +1,124 @@
+"""The state byte of an EVCC2/3, and what can be said from it.
+
+Source: ABL EVCC2/3 manual, annex 3.4. The byte reads as the state's name in hex:
+0xA1 is A1, 0xF9 is F9, 0xFB is F11. F14 to F17 are only mentioned (register 0x0006
+bit 15, C3, C4): F14 and F15 are taken as 0xFE and 0xFF; F16 and F17 do not fit a
+byte and show as C3. F12 and F13 do not exist.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from ..model import Fault, Status
+
+A1: Final = 0xA1
+B1: Final = 0xB1
+B2: Final = 0xB2
+C2: Final = 0xC2
+C3: Final = 0xC3
+C4: Final = 0xC4
+E0: Final = 0xE0
+E1: Final = 0xE1
+E2: Final = 0xE2
+E3: Final = 0xE3
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """What a state says by itself; ``None``: not told."""
+
+    name: str
+    """As the manual writes it; an unknown one as its byte in hex."""
+    status: Status | None = None
+    charging: bool | None = None
+    outlet_enabled: bool | None = None
+    tells_plugged: bool = False
+    """Bit 63 of register 0x002E counts (not in Ex and Fx)."""
+    no_current: bool = False
+    """The contactor is open: no current can flow (PROTOCOLS.md, 2)."""
+    fault: Fault | None = None
+
+
+def _waiting(name: str, status: Status) -> State:
+    return State(
+        name,
+        status=status,
+        charging=False,
+        outlet_enabled=True,
+        tells_plugged=True,
+        no_current=True,
+    )
+
+
+def _charging(name: str, fault: Fault | None = None) -> State:
+    return State(
+        name,
+        status=Status.CHARGING,
+        charging=True,
+        outlet_enabled=True,
+        tells_plugged=True,
+        fault=fault,
+    )
+
+
+def _failure(name: str, fault: Fault) -> State:
+    return State(name, status=Status.FAULTED, fault=fault)
+
+
+STATES: Final[Mapping[int, State]] = {
+    A1: _waiting("A1", Status.AVAILABLE),
+    # The car asks and is not permitted yet.
+    B1: _waiting("B1", Status.PREPARING),
+    # The car has the permission and takes nothing; also for the moment between
+    # plugging in and its first current, which the box does not tell apart.
+    B2: _waiting("B2", Status.SUSPENDED_EV),
+    C2: _charging("C2"),
+    # An example in 1.3 has C3 for "C2, I > 1 A": whether the current is reduced is
+    # for bit 62 to say.
+    C3: _charging("C3"),
+    C4: _charging("C4", Fault.LOAD_IMBALANCE),
+    E0: State(
+        "E0",
+        status=Status.UNAVAILABLE,
+        charging=False,
+        outlet_enabled=False,
+        no_current=True,
+    ),
+    E1: State("E1", status=Status.UNAVAILABLE),
+    E2: State("E2", status=Status.UNAVAILABLE),
+    E3: State("E3", status=Status.UNAVAILABLE),
+    0xF1: _failure("F1", Fault.CONTACTOR_WELDED),
+    0xF2: _failure("F2", Fault.INTERNAL),
+    0xF3: _failure("F3", Fault.DC_RESIDUAL_CURRENT),
+    0xF4: _failure("F4", Fault.UPSTREAM_TIMEOUT),
+    0xF5: _failure("F5", Fault.SOCKET_LOCK),
+    0xF6: _failure("F6", Fault.CABLE_CODE),
+    0xF7: _failure("F7", Fault.VENTILATION_REQUESTED),
+    0xF8: _failure("F8", Fault.PILOT),
+    0xF9: _failure("F9", Fault.OVERCURRENT),
+    0xFA: _failure("F10", Fault.TEMPERATURE),
+    0xFB: _failure("F11", Fault.CONTACTOR_OPEN),
+    0xFE: _failure("F14", Fault.UPSTREAM_TIMEOUT),
+    0xFF: _failure("F15", Fault.LOAD_IMBALANCE),
+}
+
+SETUP: Final = frozenset({E1, E2, E3})
+"""Production test, setup, idle bus: no limit is written there."""
+CHARGING: Final = frozenset({C2, C3, C4})
+
+_FAILURES: Final = 0xF0
+_OUT_OF_ORDER: Final = 0xE0
+
+
+def state_of(code: int) -> State:
+    """Return what a state byte says; an unknown one keeps its raw value."""
+    if (known := STATES.get(code)) is not None:
+        return known
+    name = f"0x{code:02X}"
+    group = code & 0xF0
+    if group == _FAILURES:
+        return State(name, status=Status.FAULTED, fault=Fault.UNKNOWN)
+    if group == _OUT_OF_ORDER:
+        return State(name, status=Status.UNAVAILABLE)
+    return State(name)
