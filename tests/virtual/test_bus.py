@@ -61,7 +61,7 @@ def test_a_reply_comes_in_pieces_at_the_wires_pace() -> None:
 def test_a_client_that_talks_into_a_reply_garbles_both() -> None:
     box = AblBox(1)
     # Slow, so that a busy machine still hits the middle of the reply.
-    slow = VirtualBus.pty(box, baud=1200, parity="E")
+    slow = VirtualBus.pty(box, baud=4800, parity="E")
     with slow as bus, RawClient(bus.url, "E") as client:
         client.write(READ_FULL)
         first = client.read(8)
