@@ -1,0 +1,190 @@
+"""Helpers of the tests that run the integration inside Home Assistant."""
+
+import asyncio
+from collections.abc import Callable
+from typing import Any
+
+from homeassistant.config_entries import ConfigSubentryData
+from homeassistant.const import STATE_UNAVAILABLE, STATE_UNKNOWN
+from homeassistant.core import (
+    Event,
+    EventStateChangedData,
+    HomeAssistant,
+    State,
+    callback,
+)
+from homeassistant.helpers import entity_registry as er
+from homeassistant.helpers.event import async_track_state_change_event
+from pytest_homeassistant_custom_component.common import MockConfigEntry
+
+from custom_components.evse_bus.const import DOMAIN, SUBENTRY_CHARGER
+
+PATIENCE = 15.0
+"""Longest time a virtual charger may take to be seen, s."""
+
+_EXTRA: dict[str, dict[str, Any]] = {
+    "abl": {"phase_order": [1, 2, 3]},
+    "evbox": {"command": 68, "information": "00" * 16, "fail_safe_timeout": 60},
+}
+
+
+def charger(
+    protocol: str,
+    address: int,
+    *,
+    serial: str | None = None,
+    title: str | None = None,
+    **data: Any,  # noqa: ANN401 - whatever the config flow may store
+) -> ConfigSubentryData:
+    """Return a charger subentry as the config flow stores it.
+
+    Polled as fast as the bus goes, unless ``data`` says otherwise.
+    """
+    return ConfigSubentryData(
+        data={
+            "address": address,
+            "serial": serial,
+            "installation_limit": 16.0,
+            "voltage": 230.0,
+            "poll_interval": 0.1,
+            "order_lifetime": None,
+            "fail_safe_current": 6.0,
+            **_EXTRA[protocol],
+            **data,
+        },
+        subentry_type=SUBENTRY_CHARGER,
+        title=title or f"Charger {address}",
+        unique_id=(
+            f"{protocol}_address_{address}"
+            if serial is None
+            else f"{protocol}_{serial}"
+        ),
+    )
+
+
+def bus_entry(
+    protocol: str,
+    url: str,
+    *chargers: ConfigSubentryData,
+    title: str = "Bus",
+    **data: Any,  # noqa: ANN401 - whatever the config flow may store
+) -> MockConfigEntry:
+    """Return a bus's config entry as the config flow stores it."""
+    return MockConfigEntry(
+        domain=DOMAIN,
+        title=title,
+        data={"protocol": protocol, "device": url, **data},
+        subentries_data=chargers,
+    )
+
+
+async def setup_bus(
+    hass: HomeAssistant,
+    protocol: str,
+    url: str,
+    *chargers: ConfigSubentryData,
+    **options: Any,  # noqa: ANN401 - those of bus_entry
+) -> MockConfigEntry:
+    """Set up a bus; return when Home Assistant has, chargers may not be seen yet."""
+    entry = bus_entry(protocol, url, *chargers, **options)
+    entry.add_to_hass(hass)
+    await hass.config_entries.async_setup(entry.entry_id)
+    await hass.async_block_till_done()
+    return entry
+
+
+def subentry_id(entry: MockConfigEntry, index: int = 0) -> str:
+    """Return the id of one of a bus's chargers."""
+    return list(entry.subentries)[index]
+
+
+def entity_id(
+    hass: HomeAssistant,
+    platform: str,
+    entry: MockConfigEntry,
+    key: str,
+    *,
+    index: int = 0,
+) -> str | None:
+    """Return an entity of a charger; a connector's key begins with its number."""
+    return er.async_get(hass).async_get_entity_id(
+        platform, DOMAIN, f"{subentry_id(entry, index)}_{key}"
+    )
+
+
+async def get_entity(
+    hass: HomeAssistant,
+    platform: str,
+    entry: MockConfigEntry,
+    key: str,
+    *,
+    index: int = 0,
+) -> str:
+    """Wait until an entity of a charger is there and has a state; return its id."""
+    found = ""
+
+    def is_there() -> bool:
+        nonlocal found
+        found = entity_id(hass, platform, entry, key, index=index) or ""
+        state = hass.states.get(found) if found else None
+        return state is not None and state.state != STATE_UNAVAILABLE
+
+    await wait_until(hass, is_there)
+    return found
+
+
+async def wait_until(hass: HomeAssistant, condition: Callable[[], object]) -> None:
+    """Wait until something holds; looked at after each event in Home Assistant."""
+    if condition():
+        return
+    holds = asyncio.Event()
+
+    @callback
+    def look(_event: Event[Any]) -> None:
+        if condition():
+            holds.set()
+
+    stop = hass.bus.async_listen("*", look)
+    try:
+        async with asyncio.timeout(PATIENCE):
+            await holds.wait()
+    finally:
+        stop()
+
+
+async def wait_for_state(
+    hass: HomeAssistant,
+    entity: str,
+    expected: str | Callable[[State], object],
+) -> State:
+    """Wait until an entity has a state, or one that a function takes; return it."""
+
+    def fits(state: State | None) -> bool:
+        if state is None:
+            return False
+        if callable(expected):
+            return state.state not in (STATE_UNAVAILABLE, STATE_UNKNOWN) and bool(
+                expected(state)
+            )
+        return state.state == expected
+
+    now = hass.states.get(entity)
+    if now is not None and fits(now):
+        return now
+    seen: asyncio.Future[State] = hass.loop.create_future()
+
+    @callback
+    def changed(event: Event[EventStateChangedData]) -> None:
+        state = event.data["new_state"]
+        if state is not None and fits(state) and not seen.done():
+            seen.set_result(state)
+
+    stop = async_track_state_change_event(hass, entity, changed)
+    try:
+        async with asyncio.timeout(PATIENCE):
+            return await seen
+    except TimeoutError:
+        message = f"{entity} is {hass.states.get(entity)}, expected {expected}"
+        raise AssertionError(message) from None
+    finally:
+        stop()
