@@ -155,7 +155,6 @@ class EvboxCharger(Charger):
         self._believed.forget()
         self._watch = LimitWatch()
         self._foreign = None
-        self._timeout_at = inf
         self._held_back = 0
 
     # -- The conversation --------------------------------------------------------

@@ -316,7 +316,7 @@ class EvboxFramer(Framer[EvboxFrame]):
             self._drop(start)
             end = buffer.find(ETX)
             # A half frame before a new one: its bytes are lost.
-            restart = buffer.rfind(STX, 1, end if end >= 0 else len(buffer))
+            restart = buffer.find(STX, 1, end if end >= 0 else len(buffer))
             if restart > 0:
                 self._overlong(restart)
                 self._drop(restart)

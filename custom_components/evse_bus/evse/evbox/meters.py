@@ -107,9 +107,7 @@ class Meters:
 
     def _identify(self, new: Totals, current: float) -> None:
         """Count up the generation of each number that may be another meter now."""
-        before = self._certain
-        if before is None:
-            return
+        before = self._certain or Totals((), new.at)
         same_number = len(before.totals) == len(new.totals)
         for index, total in enumerate(new.totals):
             if index >= len(before.totals):

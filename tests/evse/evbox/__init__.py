@@ -1,0 +1,1 @@
+"""EVBox: pure functions, a ChargePoint in simulated time, and a real wire."""
