@@ -87,7 +87,7 @@ def _probe_let_in[S: Slot](waiting: Iterable[S], last_probe: float) -> S | None:
         if slot.kind is Kind.PROBE:
             if first is None:
                 first = slot
-        elif slot.kind is Kind.POLL and slot.served < last_probe:
+        elif slot.kind is Kind.POLL and slot.served <= last_probe:
             return None
     return first
 
@@ -108,10 +108,12 @@ def _leaves_room(slot: Slot, deadlines: Iterable[Slot], now: float) -> bool:
     """Return whether every other deadline can still be met after this turn."""
     end = now + slot.worst_case
     for other in deadlines:
-        if other is slot:
+        latest = max(other.start_by, other.ready)
+        # One that is late already blocks nobody: a pause must still get through.
+        if other is slot or latest < now:
             continue
         start = max(end, other.ready)
-        if start > other.start_by:
+        if start > latest:
             return False
         end = start + other.worst_case
     return True

@@ -1,0 +1,96 @@
+"""Who speaks next: the rules one by one, and for any set of slots."""
+
+from math import inf
+
+from hypothesis import given, strategies as st
+
+from custom_components.evse_bus.evse.schedule import Kind, Slot, choose
+
+times = st.floats(0, 100)
+slots = st.builds(
+    Slot,
+    kind=st.sampled_from(Kind),
+    ready=times,
+    due=times,
+    start_by=st.just(inf) | times,
+    worst_case=st.floats(0.001, 2),
+    served=st.just(-inf) | times,
+)
+
+
+@given(st.lists(slots), times, st.just(-inf) | times)
+def test_someone_speaks_or_there_is_a_time_to_look_again(
+    waiting: list[Slot], now: float, last_probe: float
+) -> None:
+    choice = choose(waiting, now, last_probe)
+    if choice.slot is None:
+        assert not any(slot.ready <= now for slot in waiting)
+        assert choice.wake_at > now
+    else:
+        assert choice.slot.ready <= now
+
+
+@given(st.lists(slots), times)
+def test_nothing_is_started_that_would_make_a_deadline_late(
+    waiting: list[Slot], now: float
+) -> None:
+    choice = choose(waiting, now, -inf)
+    if choice.slot is None or choice.for_deadline:
+        return
+    end = now + choice.slot.worst_case
+    for other in waiting:
+        if other is not choice.slot and now <= other.start_by < inf:
+            assert end <= max(other.start_by, other.ready)
+
+
+@given(st.lists(slots, min_size=1), times)
+def test_a_pause_waits_only_for_a_deadline(waiting: list[Slot], now: float) -> None:
+    for slot in waiting:
+        slot.start_by = inf
+    waiting.append(Slot(kind=Kind.PAUSE, ready=now, due=now, worst_case=1.0))
+    choice = choose(waiting, now, -inf)
+    assert choice.slot is not None
+    assert choice.slot.kind is Kind.PAUSE
+
+
+def test_the_order_of_kinds_and_of_age() -> None:
+    late, early = (Slot(kind=Kind.POLL, due=due) for due in (2.0, 1.0))
+    probe = Slot(kind=Kind.PROBE, due=1.5)
+    command = Slot(kind=Kind.COMMAND, due=3.0)
+    pause = Slot(kind=Kind.PAUSE, due=4.0)
+    waiting = [late, probe, command, early, pause]
+    order = []
+    while waiting:
+        slot = choose(waiting, 10.0, inf).slot
+        assert slot is not None
+        order.append(slot)
+        waiting.remove(slot)
+    assert order == [pause, command, early, late, probe]
+
+
+def test_a_probe_gets_in_after_a_round_of_the_living() -> None:
+    served = Slot(kind=Kind.POLL, due=9.0, served=8.0)
+    probe = Slot(kind=Kind.PROBE, due=1.0)
+    assert choose([served, probe], 10.0, 5.0).slot is probe
+    unserved = Slot(kind=Kind.POLL, due=9.5, served=4.0)
+    assert choose([served, probe, unserved], 10.0, 5.0).slot is served
+
+
+def test_a_deadline_is_served_early_when_nothing_else_fits() -> None:
+    deadline = Slot(kind=Kind.POLL, due=9.0, start_by=10.5, worst_case=0.2)
+    long = Slot(kind=Kind.COMMAND, worst_case=1.0)
+    assert choose([long, deadline], 10.0, -inf).slot is deadline
+    deadline.start_by = 20.0
+    assert choose([long, deadline], 10.0, -inf).slot is long
+
+
+def test_two_deadlines_that_only_fit_one_after_the_other() -> None:
+    first = Slot(kind=Kind.POLL, due=1.0, start_by=10.5, worst_case=1.0)
+    second = Slot(kind=Kind.POLL, due=0.5, start_by=11.2, worst_case=1.0)
+    assert choose([first, second], 10.0, -inf).slot is first
+
+
+def test_a_late_deadline_does_not_hold_back_a_pause() -> None:
+    late = Slot(kind=Kind.POLL, start_by=5.0, worst_case=1.0)
+    pause = Slot(kind=Kind.PAUSE, worst_case=1.0)
+    assert choose([late, pause], 10.0, -inf).slot is pause

@@ -1,0 +1,132 @@
+"""Imports run one way: entities -> coordinator -> evse -> model.
+
+Read from the sources, so that a wall holds also where no test walks.
+"""
+
+import ast
+from pathlib import Path
+import subprocess
+import sys
+
+import pytest
+
+INTEGRATION = Path(__file__).parents[1] / "custom_components/evse_bus"
+EVSE = INTEGRATION / "evse"
+VIRTUAL = Path(__file__).parent / "virtual"
+PROTOCOLS = sorted(path.parent.name for path in EVSE.glob("*/charger.py"))
+
+LIBRARY_MAY = {"pymodbus", "serialx"}
+"""Third-party packages the library may import, all told in the README."""
+
+
+def imports(path: Path, root: Path) -> set[str]:
+    """Return what a file imports: relative imports as paths below ``root``."""
+    found = set()
+    package = path.relative_to(root).parent.parts
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            if node.level == 0:
+                found.add(node.module or "")
+                continue
+            up = len(package) - node.level + 1
+            assert up >= 0, f"{path} reaches out of {root}"
+            base = (*package[:up], *((node.module or "").split(".")))
+            names = [part for part in base if part]
+            if node.module is None:
+                found.update(".".join((".", *names, one.name)) for one in node.names)
+            else:
+                found.add(".".join((".", *names)))
+    return {
+        name.replace("..", "~") if name.startswith("..") else name for name in found
+    }
+
+
+def local(path: Path, root: Path) -> set[str]:
+    return {name[1:] for name in imports(path, root) if name.startswith("~")}
+
+
+def outside(path: Path, root: Path) -> set[str]:
+    found = (name for name in imports(path, root) if not name.startswith("~"))
+    return {name.split(".")[0] for name in found}
+
+
+@pytest.mark.parametrize("path", sorted(EVSE.rglob("*.py")), ids=lambda p: p.name)
+def test_the_library_stands_alone(path: Path) -> None:
+    allowed = LIBRARY_MAY | set(sys.stdlib_module_names)
+    assert outside(path, EVSE) <= allowed
+
+
+def test_the_model_imports_nothing() -> None:
+    assert local(EVSE / "model.py", EVSE) == set()
+    assert outside(EVSE / "model.py", EVSE) <= set(sys.stdlib_module_names)
+
+
+def test_the_clamp_and_the_schedule_are_pure() -> None:
+    assert local(EVSE / "safety.py", EVSE) == {"model"}
+    assert local(EVSE / "schedule.py", EVSE) == set()
+    for name in ("safety", "schedule"):
+        assert "asyncio" not in outside(EVSE / f"{name}.py", EVSE)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_protocols_do_not_know_each_other(protocol: str) -> None:
+    others = set(PROTOCOLS) - {protocol}
+    for path in (EVSE / protocol).glob("*.py"):
+        used = {name.split(".")[0] for name in local(path, EVSE)}
+        assert not used & others, path
+        assert "protocols" not in used, path
+
+
+def test_only_the_registry_knows_the_protocols() -> None:
+    for path in EVSE.glob("*.py"):
+        used = {name.split(".")[0] for name in local(path, EVSE)}
+        if path.name != "protocols.py":
+            assert not used & set(PROTOCOLS), path
+
+
+def test_only_the_line_knows_serialx_and_only_modbus_knows_pymodbus() -> None:
+    for path in EVSE.rglob("*.py"):
+        name = path.relative_to(EVSE).as_posix()
+        assert ("serialx" in outside(path, EVSE)) == (name == "line.py"), path
+        if name != "modbus.py":
+            assert "pymodbus" not in outside(path, EVSE), path
+
+
+def test_pure_parts_of_a_protocol_do_not_talk() -> None:
+    talking = {"bus", "line", "exchange", "jobs", "charger", "turns"}
+    for protocol in PROTOCOLS:
+        for name in ("frames", "registers", "duty", "states", "plausibility"):
+            path = EVSE / protocol / f"{name}.py"
+            if path.exists():
+                assert not local(path, EVSE) & talking, path
+
+
+def test_the_coordinator_does_not_know_the_entities() -> None:
+    platforms = {"sensor", "number", "switch", "binary_sensor", "button", "entity"}
+    for name in ("coordinator", "orders", "setup", "const"):
+        assert not local(INTEGRATION / f"{name}.py", INTEGRATION) & platforms
+
+
+def test_virtual_chargers_share_nothing_with_the_library() -> None:
+    for path in VIRTUAL.rglob("*.py"):
+        assert "custom_components" not in path.read_text() or (
+            path.name.startswith("test_")
+        ), path
+
+
+def test_the_library_can_be_imported_without_home_assistant() -> None:
+    """As a script would: with the folder of the integration on its path."""
+    code = (
+        "import sys; sys.modules['homeassistant'] = None; import evse.protocols;"
+        "print(*sorted(evse.protocols.PROTOCOLS))"
+    )
+    done = subprocess.run(  # noqa: S603 - our own interpreter and our own code
+        [sys.executable, "-c", code],
+        cwd=INTEGRATION,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.split() == PROTOCOLS
