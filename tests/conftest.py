@@ -4,7 +4,11 @@ Network: the test plugin blocks IP sockets. A test (or fixture) that serves or
 dials 127.0.0.1 asks for the fixture ``socket_enabled``; ptys are not blocked.
 """
 
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+import sys
+from unittest.mock import patch
 
 from hypothesis import settings
 import pytest
@@ -12,6 +16,7 @@ import pytest
 # Home Assistant finds custom integrations by importing the package
 # custom_components. The test plugin has one of its own: ours must be first.
 import custom_components
+from custom_components.evse_bus.evse.protocols import PROTOCOLS
 
 assert Path(custom_components.__file__).parents[1] == Path(__file__).parents[1]
 
@@ -28,3 +33,24 @@ def integration_can_load(request: pytest.FixtureRequest) -> None:
     request.getfixturevalue("enable_custom_integrations")
     # Our dependency `usb` would look at this machine's real ports.
     request.getfixturevalue("hass").config.components.add("usb")
+
+
+@pytest.fixture
+def quick_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait less for chargers that are not there; searches are the same otherwise."""
+    abl = PROTOCOLS["abl"]
+    timing = replace(abl.timing, reply_timeout=0.1)
+    monkeypatch.setitem(PROTOCOLS, "abl", replace(abl, timing=timing))
+    evbox_scan = "custom_components.evse_bus.evse.evbox.scan"
+    monkeypatch.setattr(sys.modules[evbox_scan], "RETRY_PAUSE", 0.2)
+
+
+@pytest.fixture
+def not_set_up() -> Iterator[None]:
+    """Let flows create entries that are then not set up."""
+    init = "custom_components.evse_bus"
+    with (
+        patch(f"{init}.async_setup_entry", return_value=True),
+        patch(f"{init}.async_unload_entry", return_value=True),
+    ):
+        yield

@@ -17,6 +17,7 @@ from homeassistant.core import callback
 from homeassistant.data_entry_flow import AbortFlow
 
 from .const import (
+    CONF_COMMAND,
     CONF_FAIL_SAFE_CURRENT,
     CONF_FAIL_SAFE_TIMEOUT,
     CONF_INSTALLATION_LIMIT,
@@ -27,6 +28,8 @@ from .const import (
 from .evse.model import RefusedOrderError, ScanReport
 from .evse.protocol import Progress, Protocol
 from .evse.protocols import PROTOCOLS
+from .flow_address import ADDRESSES, Errors, typed_addresses
+from .flow_charger import CONF_EXPERT, short_name
 from .flow_scan import (
     Imposed,
     async_search,
@@ -37,15 +40,12 @@ from .flow_scan import (
     port_name,
 )
 from .flow_schema import (
-    ADDRESSES,
-    Errors,
     bus_data,
     check_impose,
     impose_form,
     port_form,
     port_suggestions,
     protocol_form,
-    typed_addresses,
 )
 from .flow_steps import ChargerSteps
 from .setup import line_settings, protocol_of
@@ -191,6 +191,9 @@ class EvseBusConfigFlow(
                         CONF_FAIL_SAFE_TIMEOUT,
                     )
                 }
+                if single:
+                    command = user_input[CONF_COMMAND]
+                    self.suggestions[CONF_EXPERT] = {CONF_COMMAND: command}
                 return await self.async_step_scan()
         return self.async_show_form(
             step_id=step_id,
@@ -272,4 +275,4 @@ def _port_placeholders(protocol: Protocol) -> dict[str, str]:
 
 def _title(data: Mapping[str, Any]) -> str:
     """Return a bus's name, as long as nobody gave it another."""
-    return f"{protocol_of(data).name} bus ({port_name(data[CONF_DEVICE])})"
+    return f"{short_name(protocol_of(data))} bus ({port_name(data[CONF_DEVICE])})"

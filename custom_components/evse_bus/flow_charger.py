@@ -23,11 +23,11 @@ from .const import (
 )
 from .evse.model import MINIMUM_CURRENT
 from .evse.safety import MAXIMUM_TIMEOUT
+from .flow_address import ADDRESSES, Errors
 from .flow_schema import (
-    ADDRESSES,
+    COMMANDS,
     DEFAULT_FAIL_SAFE_TIMEOUT,
     SUGGESTED_LIMIT,
-    Errors,
     amperes,
     check_currents,
     check_timeout,
@@ -78,9 +78,14 @@ class Candidate:
         }
 
 
+def short_name(protocol: Protocol) -> str:
+    """Return the maker's name."""
+    return protocol.name.split()[0]
+
+
 def default_name(protocol: Protocol, address: int) -> str:
     """Return the name offered for a charger."""
-    return f"{protocol.name} {ADDRESSES[protocol.key].show(address)}"
+    return f"{short_name(protocol)} {ADDRESSES[protocol.key].show(address)}"
 
 
 # -- The form --------------------------------------------------------------------
@@ -128,7 +133,7 @@ def _expert_form(protocol: Protocol) -> vol.Schema:
     if _has(protocol, CONF_COMMAND):
         form[
             vol.Required(CONF_COMMAND, default=str(default_of(protocol, CONF_COMMAND)))
-        ] = dropdown(CONF_COMMAND, ("68", "69"))
+        ] = dropdown(CONF_COMMAND, COMMANDS)
     if _has(protocol, CONF_INFORMATION):
         zeros = bytes(INFORMATION_BYTES).hex()
         form[vol.Required(CONF_INFORMATION, default=zeros)] = TextSelector()
@@ -143,8 +148,10 @@ def _has(protocol: Protocol, name: str) -> bool:
     return any(one.name == name for one in fields(protocol.config))
 
 
-def check_charger(typed: Mapping[str, Any]) -> Errors:
+def check_charger(typed: Mapping[str, Any], *, alone: bool) -> Errors:
     """Return what is wrong with a filled-in charger form.
+
+    ``alone``: no other charger is on the bus, or about to be.
 
     What is in the collapsed section is reported for the whole form: nobody sees a
     mark on a field that is folded away.
@@ -159,6 +166,8 @@ def check_charger(typed: Mapping[str, Any]) -> Errors:
         return errors
     if not _is_information(expert.get(CONF_INFORMATION)):
         errors["base"] = "bad_information"
+    if expert.get(CONF_COMMAND) == COMMANDS[-1] and not alone:
+        errors["base"] = "command_not_alone"
     return errors | check_timeout(typed, expert[CONF_POLL_INTERVAL])
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import urlsplit
 
 from .const import (
+    CONF_COMMAND,
     CONF_FAIL_SAFE_CURRENT,
     CONF_FAIL_SAFE_TIMEOUT,
     CONF_INSTALLATION_LIMIT,
@@ -14,7 +15,6 @@ from .const import (
 )
 from .evse.line import Line
 from .evse.model import (
-    MINIMUM_CURRENT,
     ChargerConfig,
     CurrentLimit,
     LineBusyError,
@@ -93,24 +93,23 @@ def imposed(
     """Return what a search sets, of the values that the user has confirmed."""
     fail_safe = CurrentLimit(current=typed[CONF_FAIL_SAFE_CURRENT])
     orders = Orders(
-        limit=CurrentLimit(current=typed[CONF_SEARCH_CURRENT]),
+        limit=CurrentLimit(current=float(typed[CONF_SEARCH_CURRENT])),
         fail_safe=fail_safe,
         fail_safe_timeout=int(typed[CONF_FAIL_SAFE_TIMEOUT]),
     )
-    limit = typed[CONF_INSTALLATION_LIMIT]
-    return [(_config(protocol, address, limit), orders) for address in addresses]
+    more = {CONF_INSTALLATION_LIMIT: typed[CONF_INSTALLATION_LIMIT]}
+    if CONF_COMMAND in typed:
+        more[CONF_COMMAND] = int(typed[CONF_COMMAND])
+    return [(_config(protocol, address, more), orders) for address in addresses]
 
 
 def nothing_imposed(protocol: Protocol) -> list[Imposed]:
     """Return what the search of a protocol that only reads is called with."""
-    config = _config(protocol, 0, MINIMUM_CURRENT)
-    return [(config, Orders(limit=CurrentLimit(current=0.0)))]
+    return [(_config(protocol, 0, {}), Orders(limit=CurrentLimit(current=0.0)))]
 
 
-def _config(protocol: Protocol, address: int, limit: float) -> ChargerConfig:
-    return protocol.config(
-        key="search", name="search", address=address, installation_limit=limit
-    )
+def _config(protocol: Protocol, address: int, more: Mapping[str, Any]) -> ChargerConfig:
+    return protocol.config(key="search", name="search", address=address, **more)
 
 
 async def async_search(

@@ -4,7 +4,7 @@ A form's texts stand in ``translations/en.json``.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Final
 
 from homeassistant.const import CONF_DEVICE
@@ -15,18 +15,16 @@ from homeassistant.helpers.selector import (
     NumberSelectorConfig,
     NumberSelectorMode,
     SelectOptionDict,
-    Selector,
     SelectSelector,
     SelectSelectorConfig,
     SelectSelectorMode,
     SerialPortSelector,
-    TextSelector,
-    TextSelectorConfig,
 )
 import probatio as vol
 
 from .const import (
     CONF_BAUDRATE,
+    CONF_COMMAND,
     CONF_FAIL_SAFE_CURRENT,
     CONF_FAIL_SAFE_TIMEOUT,
     CONF_INSTALLATION_LIMIT,
@@ -38,6 +36,7 @@ from .const import (
 from .evse.model import MAXIMUM_CURRENT, MINIMUM_CURRENT, RefusedOrderError
 from .evse.protocols import PROTOCOLS
 from .evse.safety import MAXIMUM_TIMEOUT, number
+from .flow_address import ADDRESSES, Errors
 
 if TYPE_CHECKING:
     from .evse.framing import LineSettings
@@ -56,87 +55,10 @@ DEFAULT_FAIL_SAFE_TIMEOUT: Final = 60
 INTERVALS_PER_TIMEOUT: Final = 3
 """A time-out must outlast this many polls, or one lost answer sets it off."""
 
-type Errors = dict[str, str]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AddressForm:
-    """How people name a place on a protocol's bus."""
-
-    one: str
-    """Key of the form's field for one address."""
-    many: str
-    """Key of the field for several."""
-    error: str
-    """Said of anything that is no such address."""
-    lowest: int
-    highest: int
-    any: int | None = None
-    """Address that every box answers to, for a box that is alone on its line."""
-    is_serial: bool = False
-    """The address is the serial number."""
-    digits: int = 1
-
-    def parse(self, text: object) -> int:
-        """Return a typed address; raises ValueError when it is none."""
-        typed = str(text).strip()
-        if not typed.isdecimal() or not typed.isascii():
-            raise ValueError(typed)
-        if not self.lowest <= (address := int(typed)) <= self.highest:
-            raise ValueError(typed)
-        return address
-
-    def show(self, address: int) -> str:
-        """Return an address as people read it on the box."""
-        return f"{address:0{self.digits}d}"
-
-    def serial(self, address: int) -> str | None:
-        """Return the serial number that an address tells."""
-        if not self.is_serial or address == self.any:
-            return None
-        return self.show(address)
-
-    @property
-    def selector(self) -> Selector[Any]:
-        """Return the field for one address."""
-        if self.is_serial:
-            return TextSelector()
-        return SelectSelector(self._choice(multiple=False))
-
-    @property
-    def selector_many(self) -> Selector[Any]:
-        """Return the field for several."""
-        if self.is_serial:
-            return TextSelector(TextSelectorConfig(multiple=True))
-        return SelectSelector(self._choice(multiple=True))
-
-    def _choice(self, *, multiple: bool) -> SelectSelectorConfig:
-        return SelectSelectorConfig(
-            options=[str(one) for one in range(self.lowest, self.highest + 1)],
-            multiple=multiple,
-            mode=SelectSelectorMode.DROPDOWN,
-        )
-
-
-ADDRESSES: Final[Mapping[str, AddressForm]] = {
-    "evbox": AddressForm(
-        one="serial_number",
-        many="serial_numbers",
-        error="bad_serial_number",
-        lowest=0,
-        highest=99_999_999,
-        any=0,
-        is_serial=True,
-        digits=8,
-    ),
-    "abl": AddressForm(
-        one="device_id",
-        many="device_ids",
-        error="bad_device_id",
-        lowest=1,
-        highest=16,
-    ),
-}
+COMMANDS: Final = ("68", "69")
+"""EVBox messages; 69 has no serial number, so every box feels spoken to."""
+SEARCH_CURRENTS: Final = ("0", "6")
+"""What a search may set, A: no more before a box has told its maximum."""
 
 
 # -- Fields ----------------------------------------------------------------------
@@ -198,7 +120,7 @@ def is_number(value: object) -> bool:
 
 def check_currents(typed: Mapping[str, Any]) -> Errors:
     """Return what is wrong with the currents of a form."""
-    keys = [CONF_INSTALLATION_LIMIT, CONF_SEARCH_CURRENT, CONF_FAIL_SAFE_CURRENT]
+    keys = (CONF_INSTALLATION_LIMIT, CONF_FAIL_SAFE_CURRENT)
     errors = {
         key: "not_a_number"
         for key in keys
@@ -301,31 +223,43 @@ def bus_data(protocol: Protocol, typed: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def impose_form(protocol: Protocol, *, ask_addresses: bool) -> vol.Schema:
-    """Ask for all that a search sets, where every message sets limits."""
+    """Ask for all that a search sets, where every message sets limits.
+
+    Without addresses everybody is searched: then also those that know only the
+    message without a serial number can be found.
+    """
     address = ADDRESSES[protocol.key]
-    form: dict[vol.Marker, object] = {}
+    first: dict[vol.Marker, object] = {}
+    last: dict[vol.Marker, object] = {}
     if ask_addresses:
-        form[vol.Required(address.many)] = address.selector_many
+        first[vol.Required(address.many)] = address.selector_many
+    else:
+        usual = str(default_of(protocol, CONF_COMMAND))
+        last[vol.Required(CONF_COMMAND, default=usual)] = dropdown(
+            CONF_COMMAND, COMMANDS
+        )
+    last[vol.Required(CONF_CONFIRM, default=False)] = BooleanSelector()
     return vol.Schema(
-        form
+        first
         | {
             suggest(CONF_INSTALLATION_LIMIT, SUGGESTED_LIMIT): amperes(MINIMUM_CURRENT),
-            vol.Required(CONF_SEARCH_CURRENT, default=MINIMUM_CURRENT): amperes(),
+            vol.Required(CONF_SEARCH_CURRENT, default=SEARCH_CURRENTS[-1]): dropdown(
+                CONF_SEARCH_CURRENT, SEARCH_CURRENTS
+            ),
             vol.Required(CONF_FAIL_SAFE_CURRENT, default=MINIMUM_CURRENT): amperes(),
             vol.Required(
                 CONF_FAIL_SAFE_TIMEOUT, default=DEFAULT_FAIL_SAFE_TIMEOUT
             ): quantity(1, MAXIMUM_TIMEOUT, 1, "s"),
-            vol.Required(CONF_CONFIRM, default=False): BooleanSelector(),
         }
+        | last
     )
 
 
 def check_impose(protocol: Protocol, typed: Mapping[str, Any]) -> Errors:
     """Return what is wrong with the values that a search would set."""
-    errors = check_currents(typed)
-    if not errors and 0 < typed[CONF_SEARCH_CURRENT] < MINIMUM_CURRENT:
-        errors[CONF_SEARCH_CURRENT] = "below_minimum"
-    errors |= check_timeout(typed, default_of(protocol, CONF_POLL_INTERVAL))
+    errors = check_currents(typed) | check_timeout(
+        typed, default_of(protocol, CONF_POLL_INTERVAL)
+    )
     if not typed[CONF_CONFIRM]:
         errors[CONF_CONFIRM] = "not_confirmed"
     return errors
@@ -363,35 +297,3 @@ def found_options(
         )
         for one in found
     ]
-
-
-def manual_form(protocol: Protocol, *, multiple: bool) -> vol.Schema:
-    """Ask where the chargers are."""
-    address = ADDRESSES[protocol.key]
-    if multiple:
-        return vol.Schema({vol.Required(address.many): address.selector_many})
-    return vol.Schema({vol.Required(address.one): address.selector})
-
-
-def typed_addresses(
-    protocol: Protocol, typed: Mapping[str, Any], taken: Iterable[int] = ()
-) -> tuple[list[int], Errors]:
-    """Return the addresses typed into a form, and what is wrong with them."""
-    form = ADDRESSES[protocol.key]
-    key = form.many if form.many in typed else form.one
-    texts = typed[key] if form.many in typed else [typed[key]]
-    try:
-        addresses = [form.parse(text) for text in texts if str(text).strip()]
-    except ValueError:
-        return [], {key: form.error}
-    taken = set(taken)
-    if not addresses:
-        return [], {key: "no_address"}
-    if len(set(addresses)) < len(addresses):
-        return [], {key: "address_twice"}
-    if taken.intersection(addresses):
-        return [], {key: "address_taken"}
-    everyone = taken.union(addresses)
-    if form.any in everyone and len(everyone) > 1:
-        return [], {key: "any_not_alone"}
-    return addresses, {}

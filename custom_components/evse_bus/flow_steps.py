@@ -16,6 +16,7 @@ from .const import (
     SUBENTRY_CHARGER,
 )
 from .evse.model import ScanReport
+from .flow_address import ADDRESSES, Errors, manual_form, typed_addresses
 from .flow_charger import (
     Candidate,
     charger_data,
@@ -25,14 +26,10 @@ from .flow_charger import (
 )
 from .flow_scan import error_key
 from .flow_schema import (
-    ADDRESSES,
     CONF_CHARGERS,
-    Errors,
     check_currents,
     found_form,
     found_options,
-    manual_form,
-    typed_addresses,
 )
 from .setup import charger_unique_id, line_settings
 
@@ -94,8 +91,12 @@ class ChargerSteps[
         """Search, and show how far it is."""
         if self._scan_task is None:
             # The flow manager cancels it when the flow is closed.
+            # It must not be over at once: the manager would hand what was typed
+            # last to the step that comes after the search.
             self._scan_task = self.hass.async_create_background_task(
-                self.async_scan(self.async_update_progress), "evse_bus search"
+                self.async_scan(self.async_update_progress),
+                "evse_bus search",
+                eager_start=False,
             )
         if not self._scan_task.done():
             return self.async_show_progress(
@@ -276,7 +277,8 @@ class ChargerSteps[
         )
 
     def _take_charger(self, candidate: Candidate, typed: dict[str, Any]) -> Errors:
-        errors = check_charger(typed)
+        alone = not self.taken() and len(self._ready) + len(self._pending) == 1
+        errors = check_charger(typed, alone=alone)
         if ADDRESSES[self.protocol.key].one in typed:
             # Found without its serial number: here it can be given.
             addresses, wrong = typed_addresses(self.protocol, typed, self.taken())

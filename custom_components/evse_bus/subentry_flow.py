@@ -20,6 +20,7 @@ from .const import (
     SUBENTRY_CHARGER,
 )
 from .evse.model import NotAvailableError, ScanReport
+from .flow_address import ADDRESSES, Errors, typed_addresses
 from .flow_charger import (
     charger_data,
     charger_form,
@@ -27,7 +28,6 @@ from .flow_charger import (
     check_charger,
 )
 from .flow_scan import async_search, nothing_imposed
-from .flow_schema import ADDRESSES, Errors, typed_addresses
 from .flow_steps import ChargerSteps
 from .setup import charger_unique_id, protocol_of
 
@@ -106,7 +106,7 @@ class ChargerSubentryFlow(
         errors: Errors = {}
         if user_input is not None:
             addresses, errors = typed_addresses(self.protocol, user_input, self.taken())
-            errors |= check_charger(user_input)
+            errors |= check_charger(user_input, alone=not self.taken())
             if not errors:
                 [address] = addresses
                 serial = self._serial(address, user_input)

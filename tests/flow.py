@@ -1,0 +1,250 @@
+"""Flows as the frontend goes through them, each text they show looked up."""
+
+import asyncio
+from collections.abc import Mapping
+from functools import cache
+import json
+from pathlib import Path
+import re
+from typing import TYPE_CHECKING, Any
+
+from homeassistant.config_entries import (
+    SOURCE_RECONFIGURE,
+    SOURCE_USER,
+    ConfigEntry,
+    ConfigSubentry,
+)
+from homeassistant.core import Event, callback
+from homeassistant.data_entry_flow import (
+    EVENT_DATA_ENTRY_FLOW_PROGRESS_UPDATE,
+    EVENT_DATA_ENTRY_FLOW_PROGRESSED,
+    FlowResultType,
+    section,
+)
+from homeassistant.helpers.selector import SelectSelector
+import probatio as vol
+
+from custom_components.evse_bus.const import DOMAIN, SUBENTRY_CHARGER
+
+if TYPE_CHECKING:
+    from homeassistant.core import HomeAssistant
+
+ENGLISH = Path(__file__).parents[1] / f"custom_components/{DOMAIN}/translations/en.json"
+PATIENCE = 50
+NOWHERE = "/dev/serial/by-id/usb-there-is-no-such-adapter"
+IMPOSED = {
+    "installation_limit": 20,
+    "search_current": "6",
+    "fail_safe_current": 6.5,
+    "fail_safe_timeout": 90,
+    "confirm": True,
+}
+"""What is confirmed before an EVBox is searched."""
+
+
+@cache
+def english() -> dict[str, Any]:
+    return json.loads(ENGLISH.read_text())
+
+
+class Flow:
+    """One flow of the config entry or of one of its subentries."""
+
+    def __init__(self, hass: HomeAssistant, entry: ConfigEntry | None = None) -> None:
+        self.hass = hass
+        self.entry = entry
+        self.result: dict[str, Any] = {}
+        self.progress: list[float] = []
+        self.shown: list[str] = []
+        self.texts = english()["config"]
+        self.manager = hass.config_entries.flow
+
+    @classmethod
+    async def add_bus(cls, hass: HomeAssistant) -> Flow:
+        flow = cls(hass)
+        await flow._start(DOMAIN, {"source": SOURCE_USER})
+        return flow
+
+    @classmethod
+    async def change_bus(cls, hass: HomeAssistant, entry: ConfigEntry) -> Flow:
+        flow = cls(hass, entry)
+        context = {"source": SOURCE_RECONFIGURE, "entry_id": entry.entry_id}
+        await flow._start(DOMAIN, context)
+        return flow
+
+    @classmethod
+    async def add_charger(cls, hass: HomeAssistant, entry: ConfigEntry) -> Flow:
+        return await cls._charger(hass, entry, {"source": SOURCE_USER})
+
+    @classmethod
+    async def change_charger(
+        cls, hass: HomeAssistant, entry: ConfigEntry, subentry: ConfigSubentry
+    ) -> Flow:
+        context = {
+            "source": SOURCE_RECONFIGURE,
+            "subentry_id": subentry.subentry_id,
+        }
+        return await cls._charger(hass, entry, context)
+
+    @classmethod
+    async def _charger(
+        cls, hass: HomeAssistant, entry: ConfigEntry, context: dict[str, Any]
+    ) -> Flow:
+        flow = cls(hass, entry)
+        flow.texts = english()["config_subentries"][SUBENTRY_CHARGER]
+        flow.manager = hass.config_entries.subentries
+        await flow._start((entry.entry_id, SUBENTRY_CHARGER), context)
+        return flow
+
+    async def _start(self, handler: object, context: dict[str, Any]) -> None:
+        self._take(await self.manager.async_init(handler, context=context))
+
+    @property
+    def flow_id(self) -> str:
+        return self.result["flow_id"]
+
+    @property
+    def step(self) -> str:
+        return self.result["step_id"]
+
+    @property
+    def errors(self) -> dict[str, str]:
+        return self.result["errors"]
+
+    async def submit(self, typed: Mapping[str, Any] | None = None) -> Flow:
+        """Send a form."""
+        assert self.result["type"] is FlowResultType.FORM
+        self._take(await self.manager.async_configure(self.flow_id, dict(typed or {})))
+        return self
+
+    async def choose(self, option: str) -> Flow:
+        """Choose from a menu."""
+        assert option in self.result["menu_options"]
+        self._take(
+            await self.manager.async_configure(self.flow_id, {"next_step_id": option})
+        )
+        return self
+
+    async def wait(self) -> Flow:
+        """Wait for the end of a search, as the frontend does: for its event."""
+        assert self.result["type"] is FlowResultType.SHOW_PROGRESS
+        done = asyncio.Event()
+
+        @callback
+        def progressed(event: Event) -> None:
+            if event.data["flow_id"] == self.flow_id:
+                done.set()
+
+        @callback
+        def progress(event: Event) -> None:
+            if event.data["flow_id"] == self.flow_id:
+                self.progress.append(event.data["progress"])
+
+        stop = [
+            self.hass.bus.async_listen(EVENT_DATA_ENTRY_FLOW_PROGRESSED, progressed),
+            self.hass.bus.async_listen(EVENT_DATA_ENTRY_FLOW_PROGRESS_UPDATE, progress),
+        ]
+        try:
+            async with asyncio.timeout(PATIENCE):
+                await done.wait()
+        finally:
+            for one in stop:
+                one()
+        self._take(await self.manager.async_configure(self.flow_id))
+        return self
+
+    def abort(self) -> None:
+        """Close the dialogue."""
+        self.manager.async_abort(self.flow_id)
+
+    def tells(self, *words: str) -> bool:
+        """Return whether one text of the present step has all these words."""
+        return any(all(word in text for word in words) for text in self.shown)
+
+    # -- Everything that is shown has a text --------------------------------------
+
+    def _take(self, result: Mapping[str, Any]) -> None:
+        self.result = dict(result)
+        self.shown = []
+        kind = result["type"]
+        given = result.get("description_placeholders") or {}
+        if kind is FlowResultType.ABORT:
+            if "translation_domain" not in result:
+                self._text(self.texts["abort"][result["reason"]], given)
+        elif kind is FlowResultType.SHOW_PROGRESS:
+            self._text(self.texts["progress"][result["progress_action"]], given)
+        elif kind is FlowResultType.MENU:
+            texts = self._step_texts(given)
+            for option in result["menu_options"]:
+                self._text(texts["menu_options"][option], given)
+        elif kind is FlowResultType.FORM:
+            texts = self._step_texts(given)
+            for error in (result["errors"] or {}).values():
+                self._text(self.texts["error"][error], given)
+            if result["data_schema"] is not None:
+                self._fields(result["data_schema"], texts, given)
+
+    def _step_texts(self, given: Mapping[str, str]) -> dict[str, Any]:
+        texts = self.texts["step"][self.step]
+        self._text(texts["title"], given)
+        self._text(texts["description"], given)
+        return texts
+
+    def _fields(
+        self, schema: vol.Schema, texts: dict[str, Any], given: Mapping[str, str]
+    ) -> None:
+        for key, field in schema.schema.items():
+            if isinstance(field, section):
+                inner = texts["sections"][key.schema]
+                self._text(inner["name"], given)
+                self._text(inner["description"], given)
+                self._fields(field.schema, inner, given)
+                continue
+            self._text(texts["data"][key.schema], given)
+            self._text(texts["data_description"][key.schema], given)
+            if isinstance(field, SelectSelector) and (
+                key := field.config.get("translation_key")
+            ):
+                labels = english()["selector"][key]["options"]
+                assert set(field.config["options"]) <= set(labels)
+
+    def _text(self, text: str, given: Mapping[str, str]) -> None:
+        wanted = set(re.findall(r"{(\w+)}", text))
+        assert wanted <= given.keys(), text
+        self.shown.append(text.format(**given))
+
+
+def fields(flow: Flow) -> dict[str, Any]:
+    """Return what a form offers: suggested values and defaults, by key."""
+    return _offered(flow.result["data_schema"])
+
+
+def _offered(schema: vol.Schema) -> dict[str, Any]:
+    offered = {}
+    for key, field in schema.schema.items():
+        if isinstance(field, section):
+            offered[key.schema] = _offered(field.schema)
+        elif key.description and "suggested_value" in key.description:
+            offered[key.schema] = key.description["suggested_value"]
+        elif callable(key.default):
+            offered[key.schema] = key.default()
+    return offered
+
+
+async def port_step(
+    hass: HomeAssistant, protocol: str, device: str, **line: object
+) -> Flow:
+    flow = await Flow.add_bus(hass)
+    assert flow.step == "user"
+    await flow.submit({"protocol": protocol})
+    assert flow.step == "port"
+    return await flow.submit({"device": device, "line": line})
+
+
+def charger(name: str, limit: float = 16, **more: object) -> dict[str, Any]:
+    return {
+        "name": name,
+        "installation_limit": limit,
+        "fail_safe_current": 6,
+        "expert": {},
+    } | more

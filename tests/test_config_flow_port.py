@@ -1,0 +1,203 @@
+"""The port of a bus: what can be wrong with it, and how it is changed."""
+
+import errno
+import fcntl
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+from unittest.mock import patch
+
+from homeassistant.data_entry_flow import FlowResultType
+import pytest
+from pytest_homeassistant_custom_component.common import MockConfigEntry
+
+from custom_components.evse_bus.const import DOMAIN
+from custom_components.evse_bus.evse.protocols import PROTOCOLS
+from tests.flow import IMPOSED, NOWHERE, Flow, charger, english, fields, port_step
+from tests.virtual import (
+    EvboxChargePoint,
+    VirtualBus,
+)
+
+if TYPE_CHECKING:
+    from homeassistant.core import HomeAssistant
+
+
+pytestmark = pytest.mark.usefixtures("not_set_up", "quick_search")
+
+
+OPEN = "custom_components.evse_bus.evse.line.create_serial_connection"
+
+
+async def test_port_errors_are_told_apart(hass: HomeAssistant, tmp_path: Path) -> None:
+    with VirtualBus.pty() as bus:
+        flow = await port_step(hass, "evbox", NOWHERE)
+        assert flow.errors == {"base": "port_missing"}
+
+        other = os.open(bus.url, os.O_RDWR | os.O_NOCTTY)
+        fcntl.flock(other, fcntl.LOCK_EX)
+        await flow.submit({"device": bus.url, "line": {}})
+        assert flow.errors == {"base": "port_busy"}
+        os.close(other)
+
+        no_port = tmp_path / "no_port"
+        no_port.touch()
+        await flow.submit({"device": str(no_port), "line": {}})
+        assert flow.errors == {"base": "port_settings"}
+
+        await flow.submit({"device": "socket://nothing", "line": {}})
+        assert flow.errors == {"base": "port_settings"}
+
+        await flow.submit({"device": " ", "line": {}})
+        assert flow.errors == {"device": "no_port"}
+
+        await flow.submit({"device": bus.url, "line": {"baudrate": "nan"}})
+        assert flow.errors == {"base": "bad_baudrate"}
+
+        await flow.submit({"device": bus.url, "line": {}})
+        assert flow.step == "impose"
+        await bus.wait_for_async(lambda: not bus.connected)
+        flow.abort()
+
+
+@pytest.mark.parametrize(
+    ("error", "key"),
+    [
+        (PermissionError(errno.EACCES, "not yours"), "port_permission"),
+        (OSError(errno.EMFILE, "too many open files"), "cannot_open"),
+        (RuntimeError("a library's own"), "unknown"),
+    ],
+)
+async def test_port_errors_that_only_a_kernel_can_make(
+    hass: HomeAssistant,
+    error: Exception,
+    key: str,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with patch(OPEN, side_effect=error):
+        flow = await port_step(hass, "evbox", NOWHERE)
+    assert flow.errors == {"base": key}
+    if key != "port_permission":
+        assert str(error) in caplog.text
+    flow.abort()
+
+
+@pytest.mark.usefixtures("socket_enabled")
+async def test_network_port_that_nobody_serves(hass: HomeAssistant) -> None:
+    with VirtualBus.tcp() as bus:
+        url = bus.url
+    flow = await port_step(hass, "evbox", url)
+    assert flow.errors == {"base": "port_missing"}
+    flow.abort()
+
+
+@pytest.mark.usefixtures("socket_enabled")
+async def test_bus_on_a_network_port(hass: HomeAssistant) -> None:
+    with VirtualBus.tcp(EvboxChargePoint(42)) as bus:
+        flow = await port_step(hass, "evbox", bus.url)
+        await flow.choose("search_addresses")
+        await flow.submit(IMPOSED | {"serial_numbers": ["42"]})
+        await flow.wait()
+        await flow.submit({"chargers": ["42"], "installation_limit": 16})
+        await flow.submit(charger("Box", fail_safe_timeout=60))
+        await flow.submit()
+    entry = flow.result["result"]
+    assert entry.title == f"EVBox bus ({bus.url.split('//')[1]})"
+
+
+async def test_overrides_are_stored_and_used(hass: HomeAssistant) -> None:
+    with VirtualBus.pty() as bus:
+        flow = await port_step(
+            hass, "evbox", bus.url, baudrate=19200, parity="e", stop_bits="2"
+        )
+        await flow.choose("manual")
+        await flow.submit({"serial_numbers": ["42"]})
+        await flow.submit(charger("Box", fail_safe_timeout=60))
+        await flow.submit()
+    assert flow.result["result"].data == {
+        "protocol": "evbox",
+        "device": bus.url,
+        "baudrate": 19200,
+        "parity": "E",
+        "stop_bits": 2,
+    }
+
+
+async def test_one_port_is_one_bus(hass: HomeAssistant, tmp_path: Path) -> None:
+    with VirtualBus.pty() as bus:
+        MockConfigEntry(
+            domain=DOMAIN, data={"protocol": "abl", "device": bus.url}
+        ).add_to_hass(hass)
+        flow = await port_step(hass, "evbox", bus.url)
+        assert flow.result["reason"] == "already_configured"
+
+        # Neither is it another one by another name.
+        link = tmp_path / "usb-adapter"
+        link.symlink_to(bus.url)
+        flow = await port_step(hass, "evbox", str(link))
+        assert flow.result["type"] is FlowResultType.ABORT
+        assert flow.result["reason"] == "already_configured"
+
+
+async def test_another_network_port_is_another_bus(hass: HomeAssistant) -> None:
+    MockConfigEntry(
+        domain=DOMAIN, data={"protocol": "abl", "device": "socket://192.0.2.5:1"}
+    ).add_to_hass(hass)
+    flow = await port_step(hass, "evbox", NOWHERE)
+    assert flow.errors == {"base": "port_missing"}
+    flow.abort()
+
+
+def test_protocols_say_how_they_use_the_line() -> None:
+    labels = english()["selector"]["protocol"]["options"]
+    assert labels.keys() == PROTOCOLS.keys()
+    for key, protocol in PROTOCOLS.items():
+        assert str(protocol.settings) in labels[key]
+
+
+def bus_entry(hass: HomeAssistant, device: str, **more: object) -> MockConfigEntry:
+    entry = MockConfigEntry(
+        domain=DOMAIN,
+        title=f"EVBox bus ({Path(device).name})",
+        data={"protocol": "evbox", "device": device} | more,
+    )
+    entry.add_to_hass(hass)
+    return entry
+
+
+async def test_port_is_changed_once_it_can_be_opened(hass: HomeAssistant) -> None:
+    entry = bus_entry(hass, NOWHERE, baudrate=9600)
+    with VirtualBus.pty() as bus:
+        flow = await Flow.change_bus(hass, entry)
+        assert flow.step == "reconfigure"
+        assert fields(flow) == {
+            "device": NOWHERE,
+            "line": {"baudrate": 9600, "parity": "n", "stop_bits": "1"},
+        }
+        await flow.submit({"device": NOWHERE, "line": {}})
+        assert flow.errors == {"base": "port_missing"}
+        assert entry.data["baudrate"] == 9600
+        await flow.submit({"device": bus.url, "line": {}})
+        assert flow.result["reason"] == "reconfigure_successful"
+        await hass.async_block_till_done()
+    assert entry.data == {"protocol": "evbox", "device": bus.url}
+    assert entry.title.endswith(f" ({Path(bus.url).name})")
+
+
+async def test_own_name_of_a_bus_is_kept(hass: HomeAssistant) -> None:
+    entry = bus_entry(hass, NOWHERE)
+    hass.config_entries.async_update_entry(entry, title="Car park")
+    with VirtualBus.pty() as bus:
+        flow = await Flow.change_bus(hass, entry)
+        await flow.submit({"device": bus.url, "line": {}})
+        assert flow.result["reason"] == "reconfigure_successful"
+    assert entry.title == "Car park"
+
+
+async def test_port_of_another_bus_is_refused(hass: HomeAssistant) -> None:
+    entry = bus_entry(hass, NOWHERE)
+    bus_entry(hass, "/dev/ttyOther")
+    flow = await Flow.change_bus(hass, entry)
+    await flow.submit({"device": "/dev/ttyOther", "line": {}})
+    assert flow.result["reason"] == "already_configured"
+    assert entry.data["device"] == NOWHERE
