@@ -173,6 +173,7 @@ class EvboxCharger(Charger):
             # Said again, it is believed at last: let the bus repeat it.
             self.statistics.implausible += 1
             self.plan(talk.now)
+            self._after_retry(talk.now)
             raise GarbledReplyError(str(error)) from error
         self.heard(talk.now)
         self.plan(talk.now)
@@ -331,6 +332,13 @@ class EvboxCharger(Charger):
         sent_at = now if self._sent_at is None else self._sent_at
         slot.ready = slot.due = sent_at + (self._pace if hurry else self._period)
         slot.start_by = max(self._deadline, slot.ready)
+
+    def _after_retry(self, now: float) -> None:
+        """Let a command be repeated before a poll imposes the older orders again."""
+        slot = self.slot
+        retry = now + self.timing.retry_pauses[0] + INTERVAL_MARGIN
+        slot.ready = slot.due = max(slot.ready, retry)
+        slot.start_by = max(slot.start_by, slot.ready)
 
     @override
     def missed(self, now: float) -> None:
