@@ -136,8 +136,10 @@ class Bus:
             self._jobs.add(job)
             self._respect_minimum(job.charger)
             self._look_again()
-        # Whoever waits may give up; the command itself is still carried out.
-        return await asyncio.shield(job.future)
+        # Whoever waits may give up; the command itself is still carried out. (A
+        # shield would report its failure, which then interests nobody.)
+        await asyncio.wait({job.future})
+        return job.future.result()
 
     async def run[T](self, step: Step[T], *, kind: Kind = Kind.PROBE) -> T:
         """Have a conversation that belongs to no charger (a scan)."""
@@ -308,11 +310,12 @@ class Bus:
         self._look_again()
 
     def _respect_minimum(self, charger: Charger | None) -> None:
-        """Let no command of a charger speak before its minimum interval."""
+        """Let nothing be said to a charger before its minimum interval is over."""
         if charger is None:
             return
         now = asyncio.get_running_loop().time()
         earliest = now + charger.minimum_pause(now)
+        charger.slot.ready = max(charger.slot.ready, earliest)
         for job in self._jobs:
             if job.charger is charger:
                 job.ready = max(job.ready, earliest)
