@@ -10,7 +10,7 @@ from contextlib import suppress
 from functools import partial
 import logging
 from math import inf
-from typing import Final
+from typing import Final, Self
 
 from .charger import Charger
 from .exchange import Talk, Wire
@@ -90,6 +90,15 @@ class Bus:
         self._jobs.fail_all(stopped)
         self.connected = False
         await self.line.close()
+
+    async def __aenter__(self) -> Self:
+        """Start, and stop at the end of the block."""
+        await self.start()
+        return self
+
+    async def __aexit__(self, *_exc: object) -> None:
+        """Stop."""
+        await self.stop()
 
     def add(self, charger: Charger) -> None:
         """Put a charger on the bus; the others do not notice."""

@@ -326,6 +326,26 @@ class Charger(ABC):
         for listener in tuple(self._listeners):
             listener()
 
+    async def wait_available(self, patience: float = 60.0) -> ChargerReading:
+        """Return the first reading, as soon as there is one.
+
+        Raises NotAvailableError when the charger has not answered within
+        ``patience`` seconds.
+        """
+        heard = asyncio.Event()
+        stop = self.subscribe(heard.set)
+        try:
+            async with asyncio.timeout(patience):
+                while self.reading is None or not self.available:
+                    heard.clear()
+                    await heard.wait()
+                return self.reading
+        except TimeoutError as error:
+            message = f"{self.config.name} does not answer"
+            raise NotAvailableError(message) from error
+        finally:
+            stop()
+
     def notice(self, fault: Fault, *, present: bool) -> None:
         """Set or clear a fault that we noticed ourselves."""
         self.noticed = self.noticed | {fault} if present else self.noticed - {fault}
