@@ -1,10 +1,15 @@
 """Helpers of the tests that run the integration inside Home Assistant."""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from typing import Any
 
-from homeassistant.config_entries import ConfigSubentryData
+from homeassistant.config_entries import (
+    ConfigEntryState,
+    ConfigSubentryData,
+    ConfigSubentryDataWithId,
+)
 from homeassistant.const import STATE_UNAVAILABLE, STATE_UNKNOWN
 from homeassistant.core import (
     Event,
@@ -18,6 +23,8 @@ from homeassistant.helpers.event import async_track_state_change_event
 from pytest_homeassistant_custom_component.common import MockConfigEntry
 
 from custom_components.evse_bus.const import DOMAIN, SUBENTRY_CHARGER
+from tests.virtual import AblBox, EvboxChargePoint, VirtualBus
+from tests.virtual.device import Device
 
 PATIENCE = 15.0
 """Longest time a virtual charger may take to be seen, s."""
@@ -34,13 +41,14 @@ def charger(
     *,
     serial: str | None = None,
     title: str | None = None,
-    **data: Any,  # noqa: ANN401 - whatever the config flow may store
-) -> ConfigSubentryData:
+    **data: object,
+) -> ConfigSubentryDataWithId:
     """Return a charger subentry as the config flow stores it.
 
     Polled as fast as the bus goes, unless ``data`` says otherwise.
     """
-    return ConfigSubentryData(
+    return ConfigSubentryDataWithId(
+        subentry_id=f"{protocol}{address}",
         data={
             "address": address,
             "serial": serial,
@@ -67,11 +75,13 @@ def bus_entry(
     url: str,
     *chargers: ConfigSubentryData,
     title: str = "Bus",
-    **data: Any,  # noqa: ANN401 - whatever the config flow may store
+    entry_id: str = "bus",
+    **data: object,
 ) -> MockConfigEntry:
     """Return a bus's config entry as the config flow stores it."""
     return MockConfigEntry(
         domain=DOMAIN,
+        entry_id=entry_id,
         title=title,
         data={"protocol": protocol, "device": url, **data},
         subentries_data=chargers,
@@ -83,7 +93,7 @@ async def setup_bus(
     protocol: str,
     url: str,
     *chargers: ConfigSubentryData,
-    **options: Any,  # noqa: ANN401 - those of bus_entry
+    **options: object,
 ) -> MockConfigEntry:
     """Set up a bus; return when Home Assistant has, chargers may not be seen yet."""
     entry = bus_entry(protocol, url, *chargers, **options)
@@ -91,6 +101,54 @@ async def setup_bus(
     await hass.config_entries.async_setup(entry.entry_id)
     await hass.async_block_till_done()
     return entry
+
+
+def charger_of(device: Device, **data: object) -> ConfigSubentryDataWithId:
+    """Return the subentry of a virtual charger."""
+    if isinstance(device, AblBox):
+        return charger("abl", device.device_id, serial=device.serial, **data)
+    assert isinstance(device, EvboxChargePoint)
+    number = int(device.serial)
+    return charger("evbox", number, serial=str(number), **data)
+
+
+@asynccontextmanager
+async def running(
+    hass: HomeAssistant,
+    *devices: Device,
+    **data: object,
+) -> AsyncIterator[tuple[MockConfigEntry, VirtualBus]]:
+    """Run a virtual bus with its chargers set up; unload before the port goes."""
+    with VirtualBus.pty(*devices) as bus:
+        chargers = [charger_of(device, **data) for device in devices]
+        entry = await setup_bus(hass, devices[0].protocol, bus.url, *chargers)
+        assert entry.state is ConfigEntryState.LOADED, entry.reason
+        try:
+            yield entry, bus
+        finally:
+            if entry.state is ConfigEntryState.LOADED:
+                await hass.config_entries.async_unload(entry.entry_id)
+                await hass.async_block_till_done()
+
+
+async def call(
+    hass: HomeAssistant,
+    service: str,
+    entity: str,
+    **data: object,
+) -> None:
+    """Call a service for an entity and wait for it."""
+    domain, name = service.split(".")
+    await hass.services.async_call(
+        domain, name, {"entity_id": entity, **data}, blocking=True
+    )
+
+
+def state_of(hass: HomeAssistant, entity: str) -> str:
+    """Return an entity's state, which must be there."""
+    state = hass.states.get(entity)
+    assert state is not None, entity
+    return state.state
 
 
 def subentry_id(entry: MockConfigEntry, index: int = 0) -> str:

@@ -7,6 +7,7 @@ when something of that context changed.
 
 import asyncio
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import datetime, timedelta
 from functools import partial
 from typing import Any, Final, override
@@ -30,6 +31,15 @@ from .setup import (
     line_settings,
     protocol_of,
 )
+
+_IN_PLACE: Final = (
+    "name",
+    "installation_limit",
+    "voltage",
+    "poll_interval",
+    "order_lifetime",
+)
+"""What of its set-up a charger looks up anew each time."""
 
 type EvseBusConfigEntry = ConfigEntry[BusCoordinator]
 type Context = tuple[str, int | None]
@@ -179,7 +189,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         if config == old.config:
             return
         LOGGER.debug("%s: its set-up was changed", config.name)
-        if _same_box(old.config, config):
+        if _changes_in_place(old.config, config):
             old.config = config
             self.devices.show_charger(unit)
             self._on_charger(unit)
@@ -324,10 +334,13 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
             update_callback()
 
 
-def _same_box(old: ChargerConfig, new: ChargerConfig) -> bool:
-    """Return whether a charger can be told its new set-up while it runs."""
-    return (
-        type(old) is type(new)
-        and old.address == new.address
-        and (old.serial is None or old.serial == new.serial)
-    )
+def _changes_in_place(old: ChargerConfig, new: ChargerConfig) -> bool:
+    """Return whether a charger can be told its new set-up while it runs.
+
+    What decides how it is spoken to is asked for once, when it is made. A serial
+    number that becomes known is the one it has found itself.
+    """
+    same = {name: getattr(old, name) for name in _IN_PLACE}
+    if old.serial is None:
+        same["serial"] = None
+    return type(old) is type(new) and replace(new, **same) == old

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Final
 from homeassistant.helpers import issue_registry as ir
 
 from .const import DOMAIN
+from .evse.evbox.timing import INTERVALS_PER_TIMEOUT
 from .evse.model import Fault, Orders
 
 if TYPE_CHECKING:
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 NOT_STORED: Final = "orders_not_stored"
 LOST: Final = "orders_lost"
+TIMEOUT_RAISED: Final = "timeout_raised"
 
 _FAULT_KEYS: Final[Mapping[Fault, str]] = {
     Fault.WRONG_CHARGER: "wrong_charger",
@@ -31,7 +33,7 @@ class BusIssues:
         """Start with none."""
         self._hass = hass
         self._entry = entry
-        self._open: set[str] = set()
+        self._open: dict[str, dict[str, str]] = {}
 
     def orders_written(self, error: Exception | None) -> None:
         """Note how writing the orders went."""
@@ -74,6 +76,30 @@ class BusIssues:
                 },
             )
 
+        self._check_timeout(unit)
+
+    def _check_timeout(self, unit: ChargerUnit) -> None:
+        """Note a fail-safe time-out that is longer than ordered."""
+        charger = unit.charger
+        reading = charger.reading
+        told = reading.details.get("minimum_interval") if reading else None
+        # The interval that counts before one is told is a guess: no news.
+        if not isinstance(told, (int, float)):
+            return
+        ordered = charger.effective_orders.fail_safe_timeout
+        used = charger.setpoint.fail_safe_timeout
+        self._set(
+            TIMEOUT_RAISED,
+            unit.subentry_id,
+            present=used > ordered and ordered < INTERVALS_PER_TIMEOUT * told,
+            placeholders={
+                "charger": unit.name,
+                "interval": f"{told:g}",
+                "ordered": str(ordered),
+                "used": str(used),
+            },
+        )
+
     def forget(self, unit: ChargerUnit) -> None:
         """Delete the issues of a charger that is no more."""
         for issue in [one for one in self._open if one.endswith(unit.subentry_id)]:
@@ -97,9 +123,10 @@ class BusIssues:
             if issue in self._open:
                 self._delete(issue)
             return
-        if issue in self._open:
+        shown = placeholders or {}
+        if self._open.get(issue) == shown:
             return
-        self._open.add(issue)
+        self._open[issue] = shown
         ir.async_create_issue(
             self._hass,
             DOMAIN,
@@ -107,9 +134,9 @@ class BusIssues:
             is_fixable=False,
             severity=ir.IssueSeverity.ERROR,
             translation_key=key,
-            translation_placeholders=placeholders,
+            translation_placeholders=shown,
         )
 
     def _delete(self, issue: str) -> None:
-        self._open.discard(issue)
+        self._open.pop(issue, None)
         ir.async_delete_issue(self._hass, DOMAIN, issue)
