@@ -13,7 +13,7 @@ from pytest_homeassistant_custom_component.common import MockConfigEntry
 
 from custom_components.evse_bus.const import DOMAIN
 from custom_components.evse_bus.evse.protocols import PROTOCOLS
-from tests.flow import IMPOSED, NOWHERE, Flow, charger, english, fields, port_step
+from tests.flow import IMPOSED, NOWHERE, charger, english, port_step
 from tests.virtual import (
     EvboxChargePoint,
     VirtualBus,
@@ -153,51 +153,3 @@ def test_protocols_say_how_they_use_the_line() -> None:
     assert labels.keys() == PROTOCOLS.keys()
     for key, protocol in PROTOCOLS.items():
         assert str(protocol.settings) in labels[key]
-
-
-def bus_entry(hass: HomeAssistant, device: str, **more: object) -> MockConfigEntry:
-    entry = MockConfigEntry(
-        domain=DOMAIN,
-        title=f"EVBox bus ({Path(device).name})",
-        data={"protocol": "evbox", "device": device} | more,
-    )
-    entry.add_to_hass(hass)
-    return entry
-
-
-async def test_port_is_changed_once_it_can_be_opened(hass: HomeAssistant) -> None:
-    entry = bus_entry(hass, NOWHERE, baudrate=9600)
-    with VirtualBus.pty() as bus:
-        flow = await Flow.change_bus(hass, entry)
-        assert flow.step == "reconfigure"
-        assert fields(flow) == {
-            "device": NOWHERE,
-            "line": {"baudrate": 9600, "parity": "n", "stop_bits": "1"},
-        }
-        await flow.submit({"device": NOWHERE, "line": {}})
-        assert flow.errors == {"base": "port_missing"}
-        assert entry.data["baudrate"] == 9600
-        await flow.submit({"device": bus.url, "line": {}})
-        assert flow.result["reason"] == "reconfigure_successful"
-        await hass.async_block_till_done()
-    assert entry.data == {"protocol": "evbox", "device": bus.url}
-    assert entry.title.endswith(f" ({Path(bus.url).name})")
-
-
-async def test_own_name_of_a_bus_is_kept(hass: HomeAssistant) -> None:
-    entry = bus_entry(hass, NOWHERE)
-    hass.config_entries.async_update_entry(entry, title="Car park")
-    with VirtualBus.pty() as bus:
-        flow = await Flow.change_bus(hass, entry)
-        await flow.submit({"device": bus.url, "line": {}})
-        assert flow.result["reason"] == "reconfigure_successful"
-    assert entry.title == "Car park"
-
-
-async def test_port_of_another_bus_is_refused(hass: HomeAssistant) -> None:
-    entry = bus_entry(hass, NOWHERE)
-    bus_entry(hass, "/dev/ttyOther")
-    flow = await Flow.change_bus(hass, entry)
-    await flow.submit({"device": "/dev/ttyOther", "line": {}})
-    assert flow.result["reason"] == "already_configured"
-    assert entry.data["device"] == NOWHERE

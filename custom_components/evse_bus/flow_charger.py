@@ -1,6 +1,6 @@
 """The form for one charger: what is asked, what is refused, what is stored. Pure."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Final
 
@@ -148,10 +148,12 @@ def _has(protocol: Protocol, name: str) -> bool:
     return any(one.name == name for one in fields(protocol.config))
 
 
-def check_charger(typed: Mapping[str, Any], *, alone: bool) -> Errors:
+def check_charger(
+    typed: Mapping[str, Any], others: Collection[Mapping[str, Any]]
+) -> Errors:
     """Return what is wrong with a filled-in charger form.
 
-    ``alone``: no other charger is on the bus, or about to be.
+    ``others``: what is stored, or known so far, of the bus's other chargers.
 
     What is in the collapsed section is reported for the whole form: nobody sees a
     mark on a field that is folded away.
@@ -166,7 +168,8 @@ def check_charger(typed: Mapping[str, Any], *, alone: bool) -> Errors:
         return errors
     if not _is_information(expert.get(CONF_INFORMATION)):
         errors["base"] = "bad_information"
-    if expert.get(CONF_COMMAND) == COMMANDS[-1] and not alone:
+    commands = {expert.get(CONF_COMMAND), *(str(o.get(CONF_COMMAND)) for o in others)}
+    if others and COMMANDS[-1] in commands:
         errors["base"] = "command_not_alone"
     return errors | check_timeout(typed, expert[CONF_POLL_INTERVAL])
 

@@ -2,11 +2,11 @@
 
 from abc import abstractmethod
 import asyncio
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from homeassistant.config_entries import ConfigSubentryData
-from homeassistant.const import CONF_DEVICE, CONF_NAME
+from homeassistant.config_entries import ConfigSubentry, ConfigSubentryData
+from homeassistant.const import CONF_ADDRESS, CONF_DEVICE, CONF_NAME
 from homeassistant.data_entry_flow import FlowContext, FlowHandler, FlowResult
 
 from .const import (
@@ -78,9 +78,13 @@ class ChargerSteps[
         """Return where one can go when a search brought nothing to add."""
         return ("scan", "manual")
 
-    def taken(self) -> dict[int, str | None]:
-        """Return addresses and unique ids of the chargers the bus has."""
-        return {}
+    def others(self) -> list[ConfigSubentry]:
+        """Return the chargers that the bus has already."""
+        return []
+
+    def taken(self) -> set[int]:
+        """Return their addresses."""
+        return {one.data[CONF_ADDRESS] for one in self.others()}
 
     # -- Search ------------------------------------------------------------------
 
@@ -277,8 +281,12 @@ class ChargerSteps[
         )
 
     def _take_charger(self, candidate: Candidate, typed: dict[str, Any]) -> Errors:
-        alone = not self.taken() and len(self._ready) + len(self._pending) == 1
-        errors = check_charger(typed, alone=alone)
+        others = self.others()
+        # Of those that are still to come nothing is known, but they will be there.
+        expected: list[Mapping[str, Any]] = [one.data for one in others]
+        expected += [one["data"] for one in self._ready]
+        expected += [{} for _ in self._pending[1:]]
+        errors = check_charger(typed, expected)
         if ADDRESSES[self.protocol.key].one in typed:
             # Found without its serial number: here it can be given.
             addresses, wrong = typed_addresses(self.protocol, typed, self.taken())
@@ -287,7 +295,7 @@ class ChargerSteps[
                 candidate = Candidate(address=addresses[0])
         serial = candidate.serial(self.protocol)
         identity = charger_unique_id(self.protocol.key, serial, candidate.address)
-        if identity in self.taken().values():
+        if identity in {one.unique_id for one in others}:
             errors["base"] = "already_configured"
         if not errors:
             self._ready.append(
@@ -309,7 +317,7 @@ class ChargerSteps[
             data = one["data"]
             cells = [
                 one["title"].replace("|", "/"),
-                address.show(data["address"]),
+                address.show(data[CONF_ADDRESS]),
                 f"{data[CONF_INSTALLATION_LIMIT]:g} A",
                 f"{data[CONF_FAIL_SAFE_CURRENT]:g} A",
             ]

@@ -5,12 +5,13 @@ from typing import TYPE_CHECKING, Any, override
 
 from homeassistant.config_entries import (
     ConfigEntryState,
+    ConfigSubentry,
     ConfigSubentryData,
     ConfigSubentryFlow,
     SubentryFlowContext,
     SubentryFlowResult,
 )
-from homeassistant.const import CONF_ADDRESS, CONF_NAME
+from homeassistant.const import CONF_NAME
 
 from .const import (
     CONF_FAIL_SAFE_CURRENT,
@@ -46,14 +47,14 @@ class ChargerSubentryFlow(
     step_after_error = "manual"
 
     @override
-    def taken(self) -> dict[int, str | None]:
+    def others(self) -> list[ConfigSubentry]:
         """Return the other chargers of the bus."""
         own = self.context.get("subentry_id")
-        return {
-            one.data[CONF_ADDRESS]: one.unique_id
+        return [
+            one
             for one in self._get_entry().get_subentries_of_type(SUBENTRY_CHARGER)
             if one.subentry_id != own
-        }
+        ]
 
     async def async_step_user(
         self,
@@ -106,12 +107,13 @@ class ChargerSubentryFlow(
         errors: Errors = {}
         if user_input is not None:
             addresses, errors = typed_addresses(self.protocol, user_input, self.taken())
-            errors |= check_charger(user_input, alone=not self.taken())
+            others = self.others()
+            errors |= check_charger(user_input, [one.data for one in others])
             if not errors:
                 [address] = addresses
                 serial = self._serial(address, user_input)
                 identity = charger_unique_id(self.protocol.key, serial, address)
-                if identity not in self.taken().values():
+                if identity not in {one.unique_id for one in others}:
                     data = charger_data(address, serial, user_input)
                     return self.async_update_and_abort(
                         entry,
@@ -141,12 +143,10 @@ class ChargerSubentryFlow(
 def _fail_safe(stored: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
     """Return the fail-safe values first confirmed, within the new limit."""
     kept = {
-        key: stored[key]
-        for key in (CONF_FAIL_SAFE_CURRENT, CONF_FAIL_SAFE_TIMEOUT)
-        if key in stored
-    }
-    if CONF_FAIL_SAFE_CURRENT in kept:
-        kept[CONF_FAIL_SAFE_CURRENT] = min(
-            kept[CONF_FAIL_SAFE_CURRENT], new[CONF_INSTALLATION_LIMIT]
+        CONF_FAIL_SAFE_CURRENT: min(
+            stored[CONF_FAIL_SAFE_CURRENT], new[CONF_INSTALLATION_LIMIT]
         )
+    }
+    if CONF_FAIL_SAFE_TIMEOUT in stored:
+        kept[CONF_FAIL_SAFE_TIMEOUT] = stored[CONF_FAIL_SAFE_TIMEOUT]
     return kept
