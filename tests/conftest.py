@@ -8,10 +8,12 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 import sys
-from unittest.mock import patch
+from unittest.mock import PropertyMock, patch
 
 from hypothesis import settings
 import pytest
+from pytest_homeassistant_custom_component.syrupy import HomeAssistantSnapshotExtension
+from syrupy.assertion import SnapshotAssertion
 
 # Home Assistant finds custom integrations by importing the package
 # custom_components. The test plugin has one of its own: ours must be first.
@@ -52,5 +54,21 @@ def not_set_up() -> Iterator[None]:
     with (
         patch(f"{init}.async_setup_entry", return_value=True),
         patch(f"{init}.async_unload_entry", return_value=True),
+    ):
+        yield
+
+
+@pytest.fixture
+def snapshot(snapshot: SnapshotAssertion) -> SnapshotAssertion:
+    """Return snapshots as Home Assistant writes them, without changing ids."""
+    return snapshot.use_extension(HomeAssistantSnapshotExtension)
+
+
+@pytest.fixture
+def all_entities_enabled() -> Iterator[None]:
+    """Enable also the entities that are disabled unless somebody wants them."""
+    with patch(
+        "homeassistant.helpers.entity.Entity.entity_registry_enabled_default",
+        new_callable=PropertyMock(return_value=True),
     ):
         yield

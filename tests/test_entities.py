@@ -1,0 +1,125 @@
+"""All entities of both protocols as Home Assistant shows them, as snapshots."""
+
+from homeassistant.const import Platform
+from homeassistant.core import HomeAssistant
+from homeassistant.helpers import device_registry as dr, entity_registry as er
+import pytest
+from syrupy.assertion import SnapshotAssertion
+
+from custom_components.evse_bus.const import DOMAIN
+from tests.common import get_entity, running, wait_for_state, wait_until
+from tests.virtual import AblBox, EvboxChargePoint
+from tests.virtual.device import Device
+
+# What depends on when one looks, or on what flowed meanwhile.
+UNSTEADY = ("round_trip", "utilisation", "requests", "timeouts")
+
+
+def boxes(protocol: str) -> tuple[Device, str]:
+    """Return a virtual charger, and the entity that is there last."""
+    if protocol == "abl":
+        return AblBox(1), "1_estimated_energy"
+    return EvboxChargePoint(1923054, 2, min_interval=0), "2_energy"
+
+
+@pytest.mark.usefixtures("all_entities_enabled")
+@pytest.mark.parametrize("protocol", ["abl", "evbox"])
+async def test_entities(
+    hass: HomeAssistant, snapshot: SnapshotAssertion, protocol: str
+) -> None:
+    device, last = boxes(protocol)
+    async with running(hass, device, poll_interval=0.5, order_lifetime=60) as (
+        entry,
+        _,
+    ):
+        energy = await get_entity(hass, "sensor", entry, last)
+        await wait_for_state(hass, energy, lambda state: float(state.state) >= 0)
+        await hass.async_block_till_done()
+        registry = er.async_get(hass)
+        entries = er.async_entries_for_config_entry(registry, entry.entry_id)
+        assert {one.domain for one in entries} <= set(Platform)
+        for one in sorted(entries, key=lambda one: one.entity_id):
+            assert one == snapshot(name=f"{one.entity_id}-entry")
+            if not one.unique_id.endswith(UNSTEADY):
+                state = hass.states.get(one.entity_id)
+                assert state == snapshot(name=f"{one.entity_id}-state")
+
+
+@pytest.mark.parametrize("protocol", ["abl", "evbox"])
+async def test_devices(
+    hass: HomeAssistant, snapshot: SnapshotAssertion, protocol: str
+) -> None:
+    device, last = boxes(protocol)
+    async with running(hass, device, poll_interval=0.5) as (entry, _):
+        await get_entity(hass, "sensor", entry, last)
+        registry = dr.async_get(hass)
+        charger = next(iter(entry.subentries))
+        find = registry.async_get_device_by_identifier
+        assert find((DOMAIN, "bus"), "bus") == snapshot(name="bus")
+        assert find((DOMAIN, charger), "bus") == snapshot(name="charger")
+        child = registry.async_get_child_device_by_identifier(
+            (DOMAIN, f"{charger}_1"), "bus"
+        )
+        assert child == snapshot(name="connector")
+
+
+async def test_only_what_a_charger_has(hass: HomeAssistant) -> None:
+    """A box without a meter tells no currents: there is nothing to estimate from."""
+    async with running(hass, AblBox(1, meter=False)) as (entry, _):
+        await get_entity(hass, "sensor", entry, "1_status")
+        await hass.async_block_till_done()
+        keys = {
+            one.unique_id.removeprefix("abl1_")
+            for one in er.async_entries_for_config_entry(er.async_get(hass), "bus")
+            if one.config_subentry_id
+        }
+    assert "1_status" in keys
+    assert not {key for key in keys if "current_l" in key or "estimated" in key}
+    assert not keys & {"fail_safe_current", "fail_safe_timeout", "orders_expired"}
+
+
+async def test_a_dead_charger_is_unavailable_and_the_others_are_not(
+    hass: HomeAssistant,
+) -> None:
+    one, two = AblBox(1), AblBox(2, serial="2W22xy00000002")
+    async with running(hass, one, two) as (entry, bus):
+        dead = await get_entity(hass, "sensor", entry, "1_status", index=1)
+        switch = await get_entity(hass, "switch", entry, "charging_allowed", index=1)
+        alive = await get_entity(hass, "sensor", entry, "1_status")
+        bus.remove(two)
+        await wait_for_state(hass, dead, "unavailable")
+        await wait_for_state(hass, switch, "unavailable")
+        assert hass.states.get(alive).state == "available"
+        bus.add(two)
+        await wait_for_state(hass, dead, "available")
+
+
+async def test_an_unplugged_adapter_and_back(
+    hass: HomeAssistant, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with running(hass, AblBox(1)) as (entry, bus):
+        status = await get_entity(hass, "sensor", entry, "1_status")
+        bus.unplug()
+        await wait_for_state(hass, status, "unavailable")
+        bus.replug()
+        await wait_for_state(hass, status, "available")
+        assert bus.opened == 2
+    warnings = [one for one in caplog.records if "the port" in one.getMessage()]
+    assert len(warnings) == 2
+
+
+async def test_statistics_are_told_when_somebody_looks(hass: HomeAssistant) -> None:
+    async with running(hass, AblBox(1)) as (entry, _):
+        coordinator = entry.runtime_data
+        await get_entity(hass, "sensor", entry, "1_status")
+        assert coordinator._stop_statistics is None
+        registry = er.async_get(hass)
+        requests = registry.async_get_entity_id("sensor", DOMAIN, "bus_requests")
+        assert registry.async_get(requests).disabled_by
+        registry.async_update_entity(requests, disabled_by=None)
+        await hass.config_entries.async_reload(entry.entry_id)
+        await wait_until(hass, lambda: hass.states.get(requests))
+        assert entry.runtime_data._stop_statistics is not None
+        coordinator = entry.runtime_data
+        await hass.config_entries.async_unload(entry.entry_id)
+        assert coordinator._stop_statistics is None
