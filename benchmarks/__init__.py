@@ -1,0 +1,1 @@
+"""Figures of EVSE Bus: how fast, how punctual, at what cost. See README.md."""

@@ -1,0 +1,115 @@
+"""(d) Processor time an exchange costs, beside another client's on the same pty."""
+
+import asyncio
+import contextlib
+from statistics import median
+import time
+
+from tmodbus import create_async_ascii_client
+
+from custom_components.evse_bus.evse.framing import LineSettings
+
+from .figures import Figure
+from .progress import say
+from .responder import ABL, ABL_PIECES, MODBUS, MODBUS_PIECES, Responder
+from .setup import abl_bus, settled
+
+NAME = "exchange-cpu"
+METHOD = """\
+Processor time (user and system) of the whole process over N reads of 5 registers from
+0x002E, an answer of 31 bytes each, other values each time; the device is another
+process on the same pty and answers at once with ready-made frames. Ours: the whole
+path (bus, schedule, ABL charger, frame, plausible reading, a listener). Beside it:
+tmodbus' ASCII client as its own factory makes it, returning five numbers. In turns,
+median of all rounds; once with answers in one piece, once in pieces of 7 bytes 2 ms
+apart, as a line at 38400 Bd delivers them. GC as Python has it."""
+
+_LINE = LineSettings(baudrate=38400)
+# Without parity: a pty takes an 8E1 open only once (see tests/virtual/ports.py).
+_REGISTER = 0x2E
+
+
+async def run(*, quick: bool) -> list[Figure]:
+    """Return the figures."""
+    figures: list[Figure] = []
+    plans = (
+        ("in one piece", ABL, MODBUS, 500 if quick else 3000),
+        ("in 5 pieces", ABL_PIECES, MODBUS_PIECES, 100 if quick else 400),
+    )
+    async with Responder() as responder:
+        for name, ours, theirs, exchanges in plans:
+            say(f"{exchanges} exchanges a round, answers {name}")
+            rounds = 3 if quick else 9
+            times = [
+                (
+                    await _ours(responder.url, ours, exchanges),
+                    await _tmodbus(responder.url, theirs, exchanges),
+                )
+                for _ in range(rounds)
+            ]
+            our, their = (median(column) for column in zip(*times, strict=True))
+            figures += [
+                _figure(f"evse_bus, answers {name}", our * 1e6, "us"),
+                _figure(f"tmodbus, answers {name}", their * 1e6, "us"),
+                _figure(
+                    f"evse_bus / tmodbus, answers {name}",
+                    median(mine / other for mine, other in times),
+                    digits=2,
+                    aim=1.0,
+                    note=f"{rounds} rounds of {exchanges}",
+                ),
+            ]
+    return figures
+
+
+async def _ours(url: str, unit: int, exchanges: int) -> float:
+    """Return the processor time of one exchange, s."""
+    bus = abl_bus(url, [unit], settings=_LINE)
+    await bus.start()
+    try:
+        await settled(bus)
+        charger = bus.chargers[f"abl-{unit}"]
+        statistics = charger.statistics
+        enough = asyncio.Event()
+        wanted = statistics.replies + exchanges
+        charger.subscribe(lambda: statistics.replies >= wanted and enough.set())
+        before, begun = statistics.replies, time.process_time()
+        await enough.wait()
+        return (time.process_time() - begun) / (statistics.replies - before)
+    finally:
+        await bus.stop()
+
+
+async def _tmodbus(url: str, unit: int, exchanges: int) -> float:
+    client = create_async_ascii_client(url, unit_id=unit, baudrate=_LINE.baudrate)
+    await client.connect()
+    try:
+        for _ in range(20):
+            await client.read_holding_registers(_REGISTER, 5)
+        begun = time.process_time()
+        for _ in range(exchanges):
+            await client.read_holding_registers(_REGISTER, 5)
+        return (time.process_time() - begun) / exchanges
+    finally:
+        with contextlib.suppress(OSError):
+            await client.disconnect()
+
+
+def _figure(  # noqa: PLR0913 - one line of the table
+    name: str,
+    value: float,
+    unit: str = "",
+    *,
+    digits: int = 0,
+    aim: float | None = None,
+    note: str = "",
+) -> Figure:
+    return Figure(
+        benchmark=NAME,
+        name=name,
+        value=value,
+        unit=unit,
+        digits=digits,
+        aim=aim,
+        note=note,
+    )

@@ -1,0 +1,102 @@
+"""Buses for the benchmarks, set up with the library alone."""
+
+import asyncio
+from collections.abc import Iterable
+from typing import Final
+
+from custom_components.evse_bus.evse.abl import PROTOCOL as ABL, AblConfig
+from custom_components.evse_bus.evse.bus import Bus
+from custom_components.evse_bus.evse.charger import Charger
+from custom_components.evse_bus.evse.evbox import PROTOCOL as EVBOX, EvboxConfig
+from custom_components.evse_bus.evse.framing import LineSettings
+from custom_components.evse_bus.evse.model import CurrentLimit, Orders
+
+from .witness import Heard
+
+ABL_LIMIT: Final = 16.0
+EVBOX_LIMIT: Final = 320.0
+"""A for a ChargePoint of 20 modules."""
+SETTLED_AFTER: Final = 1.5
+"""So long without a time-out means that all boxes have been found out about, s."""
+SETTLES_WITHIN: Final = 60.0
+
+READING_REQUEST: Final = b"03002E0005"
+"""What a regular read of an ABL box has behind its device-ID."""
+LIMIT_REQUEST: Final = b"100014"
+"""What a write of an ABL box's limit has behind its device-ID."""
+
+
+def abl_bus(
+    url: str,
+    ids: Iterable[int],
+    *,
+    poll_interval: float = 0.0,
+    settings: LineSettings | None = None,
+) -> Bus:
+    """Return a bus with wallboxes on it that are polled without pause."""
+    bus = ABL.bus(url, settings=settings)
+    for number in ids:
+        config = AblConfig(
+            key=f"abl-{number}",
+            name=f"ABL {number}",
+            address=number,
+            installation_limit=ABL_LIMIT,
+            poll_interval=poll_interval,
+        )
+        orders = Orders(limit=CurrentLimit(current=ABL_LIMIT))
+        bus.add(ABL.charger(config, orders))
+    return bus
+
+
+def evbox_bus(url: str, serials: Iterable[int], *, period: float, timeout: int) -> Bus:
+    """Return a bus with ChargePoints on it."""
+    bus = EVBOX.bus(url)
+    for serial in serials:
+        config = EvboxConfig(
+            key=f"evbox-{serial}",
+            name=f"EVBox {serial}",
+            address=serial,
+            serial=f"{serial:08d}",
+            installation_limit=EVBOX_LIMIT,
+            poll_interval=period,
+        )
+        limit = CurrentLimit(current=EVBOX_LIMIT)
+        orders = Orders(limit=limit, fail_safe=limit, fail_safe_timeout=timeout)
+        bus.add(EVBOX.charger(config, orders))
+    return bus
+
+
+async def settled(bus: Bus, dead: Iterable[str] = ()) -> None:
+    """Wait until the living are known and the dead are given up."""
+    gone = set(dead)
+    statistics = bus.wire.statistics
+    loop = asyncio.get_running_loop()
+    timeouts, since = -1, loop.time()
+    async with asyncio.timeout(SETTLES_WITHIN):
+        while True:
+            if statistics.timeouts != timeouts and not gone:
+                timeouts, since = statistics.timeouts, loop.time()
+            if loop.time() - since >= SETTLED_AFTER and all(
+                _is_given_up(one) if key in gone else one.available
+                for key, one in bus.chargers.items()
+            ):
+                return
+            await asyncio.sleep(0.1)
+
+
+def _is_given_up(charger: Charger) -> bool:
+    return charger.misses >= charger.timing.misses
+
+
+def unit_of(request: Heard) -> int:
+    """Return the device-ID that an ABL request is for."""
+    return int(request.data[1:3], 16)
+
+
+def starts_of(log: Iterable[Heard], unit: int, kind: bytes) -> list[float]:
+    """Return when requests of a kind to a box began."""
+    return [
+        heard.start
+        for heard in log
+        if heard.from_client and unit_of(heard) == unit and heard.data[3:13] == kind
+    ]

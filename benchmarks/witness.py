@@ -1,0 +1,172 @@
+"""The virtual bus in a process of its own, and its log as the witness.
+
+As a program: ``python -m benchmarks.witness SPEC`` (JSON) puts virtual chargers on a
+pty, prints its path, and then does what it reads from stdin until that ends. As a
+module: `Witness` starts such a process. Both ends use CLOCK_MONOTONIC, which is
+one clock for the whole machine, so times of the log can be compared with ours.
+"""
+
+import asyncio
+from collections.abc import Sequence
+from dataclasses import dataclass
+import json
+import sys
+from typing import Any, Self
+
+from tests.virtual import CLIENT, AblBox, Car, EvboxChargePoint, Module, VirtualBus
+from tests.virtual.device import Device
+
+from .machine import ROOT
+
+_READY_WITHIN = 15.0
+_ENDS_WITHIN = 10.0
+_LINE_LIMIT = 2**28
+"""A log of some minutes is one long line of JSON."""
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """One frame on the wire; times in seconds of CLOCK_MONOTONIC."""
+
+    start: float
+    end: float
+    from_client: bool
+    data: bytes
+
+
+class Witness:
+    """A virtual bus in another process."""
+
+    def __init__(self, protocol: str, **options: object) -> None:
+        """Say who is on the bus (see `_abl`, `_evbox`)."""
+        self._spec = json.dumps({"protocol": protocol, **options})
+        self._process: asyncio.subprocess.Process | None = None
+        self.url = ""
+
+    async def __aenter__(self) -> Self:
+        """Start the process; the port can be opened then."""
+        self._process = await asyncio.create_subprocess_exec(
+            sys.executable,
+            "-m",
+            "benchmarks.witness",
+            self._spec,
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.PIPE,
+            cwd=ROOT,
+            limit=_LINE_LIMIT,
+        )
+        async with asyncio.timeout(_READY_WITHIN):
+            self.url = str(await self._answer())
+        return self
+
+    async def __aexit__(self, *_error: object) -> None:
+        """End the process."""
+        process = self._process
+        if process is None or process.stdin is None:
+            return
+        process.stdin.close()
+        try:
+            async with asyncio.timeout(_ENDS_WITHIN):
+                await process.wait()
+        except TimeoutError:
+            process.kill()
+            await process.wait()
+
+    async def log(self, since: float = 0.0) -> list[Heard]:
+        """Return what was on the wire from then on, frame by frame."""
+        entries: Any = await self._ask({"log": since})
+        return [
+            Heard(start, end, from_client, bytes.fromhex(data))
+            for start, end, from_client, data in entries
+        ]
+
+    async def stats(self) -> dict[str, Any]:
+        """Return the virtual chargers' own counters."""
+        answer: dict[str, Any] = await self._ask({"stats": True})
+        return answer
+
+    async def kill(self, names: Sequence[str]) -> None:
+        """Let these devices fall silent."""
+        await self._ask({"kill": list(names)})
+
+    async def _ask(self, command: dict[str, object]) -> Any:  # noqa: ANN401 - JSON
+        process = self._process
+        if process is None or process.stdin is None:
+            message = "the virtual bus is not running"
+            raise RuntimeError(message)
+        process.stdin.write(json.dumps(command).encode() + b"\n")
+        await process.stdin.drain()
+        return await self._answer()
+
+    async def _answer(self) -> Any:  # noqa: ANN401 - JSON
+        if self._process is None or self._process.stdout is None:
+            message = "the virtual bus is not running"
+            raise RuntimeError(message)
+        line = await self._process.stdout.readline()
+        if not line:
+            message = "the virtual bus has ended by itself"
+            raise RuntimeError(message)
+        return json.loads(line)
+
+
+# -- In the other process ----------------------------------------------------------
+
+
+def _abl(
+    *, ids: Sequence[int], dead: Sequence[int] = (), plugged: bool = False
+) -> list[Device]:
+    """Make wallboxes that answer 2 ms after a request, without jitter."""
+    boxes: list[Device] = []
+    for number in ids:
+        car = Car()
+        box = AblBox(number, car=car, serial=f"2W22xy{number:08d}", jitter=0.0)
+        box.faults.dead = number in dead
+        if plugged:
+            car.plug_in()
+        boxes.append(box)
+    return boxes
+
+
+def _evbox(*, serials: Sequence[int], modules: int) -> list[Device]:
+    """Make ChargePoints of so many modules, a car charging at each."""
+    points: list[Device] = []
+    for serial in serials:
+        cars = [Car(phases=1 + at % 3) for at in range(modules)]
+        for car in cars:
+            car.plug_in()
+        boxes = [
+            Module(car=car, energy_wh=1000.0 * at) for at, car in enumerate(cars, 1)
+        ]
+        points.append(EvboxChargePoint(serial, boxes, max_current=400.0))
+    return points
+
+
+def _do(bus: VirtualBus, command: dict[str, Any]) -> object:
+    if "kill" in command:
+        for device in bus.devices:
+            if device.name in command["kill"]:
+                device.faults.dead = True
+        return None
+    if "stats" in command:
+        return bus.stats()
+    since = command["log"]
+    heard = [*bus.log.bursts(CLIENT), *(e for e in bus.log if e.source != CLIENT)]
+    heard.sort(key=lambda entry: entry.t)
+    return [
+        (entry.t, entry.end, entry.source == CLIENT, entry.data.hex())
+        for entry in heard
+        if entry.t >= since
+    ]
+
+
+def _main() -> None:
+    spec = json.loads(sys.argv[1])
+    make = {"abl": _abl, "evbox": _evbox}[spec.pop("protocol")]
+    with VirtualBus.pty(*make(**spec), ring=None) as bus:
+        print(json.dumps(bus.url), flush=True)
+        for line in sys.stdin:
+            print(json.dumps(_do(bus, json.loads(line))), flush=True)
+
+
+if __name__ == "__main__":
+    _main()
