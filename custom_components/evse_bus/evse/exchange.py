@@ -22,6 +22,10 @@ _BASE_REQUEST: Final = 64
 """Longest request of a conversation that belongs to no charger, bytes."""
 
 
+type Request = bytes | Callable[[], bytes]
+"""What to send; a function is asked when the line is quiet, right before it goes."""
+
+
 class Wire:
     """A line with frames on it; one exchange at a time."""
 
@@ -56,7 +60,7 @@ class Wire:
 
     async def exchange[F: Frame, T](
         self,
-        request: bytes,
+        request: Request,
         accept: Callable[[F], T | None],
         counted: ChargerStatistics,
         *,
@@ -65,11 +69,12 @@ class Wire:
         """Send a request and wait for its answer (see `Talk.exchange`)."""
         self.sent_at = None
         await self._silence()
+        data = request() if callable(request) else request
         loop = asyncio.get_running_loop()
         self._framer.reset()
         bad, noise = self._framer.bad, self._framer.noise
         started = loop.time()
-        sent = self.line.write(request, reply_may_equal=reply_may_equal)
+        sent = self.line.write(data, reply_may_equal=reply_may_equal)
         self.sent_at = sent
         pending = _PendingReply(
             accept,
@@ -78,7 +83,7 @@ class Wire:
             gap=self.timing.gap,
         )
         self._pending = pending
-        self.frames.add(Direction.OUT, request)
+        self.frames.add(Direction.OUT, data)
         self.statistics.requests += 1
         counted.requests += 1
         try:
@@ -163,12 +168,15 @@ class Talk:
 
     async def exchange[F: Frame, T](
         self,
-        request: bytes,
+        request: Request,
         accept: Callable[[F], T | None],
         *,
         reply_may_equal: bool = False,
     ) -> T:
         """Send a request and return what ``accept`` makes of its answer.
+
+        A request that is an order is given as a function: an order lowered while
+        we wait for silence must not be overtaken by the one before it.
 
         ``accept`` sees every good frame that comes: it returns ``None`` for one
         that is not the answer, and raises for an answer that says no.

@@ -47,6 +47,9 @@ class Ether(Line):
         self.rng = Random(1)  # noqa: S311 - repeatable on purpose
         self.byte_time = self.settings.byte_time
         self.damage: Callable[[bytes], bytes] = lambda data: data
+        """What becomes of bytes on their way to the library."""
+        self.watch: Callable[[Order], None] = lambda _order: None
+        """Called with each request in the moment it is sent."""
         self._open = False
         self._idle_from = -1000.0
 
@@ -81,6 +84,7 @@ class Ether(Line):
         assert body is not None, "the checksums of a request"
         request = order(body, end)
         assert request is not None, "a request as the manual has it"
+        self.watch(request)
         self.sent.append(Sent(end, request))
         self._put(data, CLIENT)
         self.last_activity = end

@@ -19,6 +19,7 @@ What this takes from the manual, and where it chooses (PROTOCOLS.md section 1):
   is set up again, and the box falls back by itself.
 """
 
+from collections.abc import Callable
 import logging
 from math import inf
 from typing import TYPE_CHECKING, Final, override
@@ -162,13 +163,13 @@ class EvboxCharger(Charger):
     @override
     async def poll(self, talk: Talk) -> None:
         """Impose what stands, and take the reading that answers it."""
-        await self._converse(talk, self.effective_orders)
+        await self._converse(talk, lambda: self.effective_orders)
 
     @override
     async def impose(self, talk: Talk, orders: Orders, change: OrderChange) -> None:
         """Send these orders; a believed answer confirms them."""
         try:
-            await self._converse(talk, orders)
+            await self._converse(talk, lambda: self.careful(orders))
         except ImplausibleReplyError as error:
             # Said again, it is believed at last: let the bus repeat it.
             self.statistics.implausible += 1
@@ -178,17 +179,23 @@ class EvboxCharger(Charger):
         self.heard(talk.now)
         self.plan(talk.now)
 
-    async def _converse(self, talk: Talk, orders: Orders) -> None:
+    async def _converse(self, talk: Talk, orders: Callable[[], Orders]) -> None:
+        """Impose the orders that count when the line is quiet; take the answer."""
         if self._wrong is not None:
             raise self._wrong
-        setpoint = self._setpoint(orders)
-        answered = False
+        setpoint: Setpoint | None = None
+
+        def request() -> bytes:
+            nonlocal setpoint
+            setpoint = self._setpoint(orders())
+            return encode(self._evbox, setpoint)
+
+        reply = None
         try:
-            reply = await talk.exchange(encode(self._evbox, setpoint), self._accept)
-            answered = True
+            reply = await talk.exchange(request, self._accept)
         finally:
-            if talk.sent_at is not None:
-                self._note_sent(talk.sent_at, setpoint, answered=answered)
+            if talk.sent_at is not None and setpoint is not None:
+                self._note_sent(talk.sent_at, setpoint, answered=reply is not None)
                 pause = self.minimum_pause(talk.now)
                 self.slot.ready = max(self.slot.ready, talk.now + pause)
         # Whatever it says, the box is there.
@@ -201,7 +208,7 @@ class EvboxCharger(Charger):
             self._hold_back()
             raise
         self._take(taken, talk.now)
-        self._outdated = setpoint != self._setpoint(orders)
+        self._outdated = setpoint != self._setpoint(orders())
 
     def _setpoint(self, orders: Orders) -> Setpoint:
         return wire_setpoint(orders, self.limits, self._believed.interval.value)

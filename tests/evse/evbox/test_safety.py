@@ -1,0 +1,399 @@
+"""The safety rules, with the wire as the witness.
+
+Whatever is asked, told, lost, damaged or unplugged, in any order: each request is
+judged in the moment it is sent, as the ChargePoint's side reads it.
+"""
+
+import asyncio
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from math import inf, nan
+from random import Random
+
+from hypothesis import HealthCheck, given, settings, strategies as st
+import pytest
+
+from custom_components.evse_bus.evse.evbox import EvboxCharger
+from custom_components.evse_bus.evse.model import (
+    CurrentLimit,
+    EvseError,
+    OrderChange,
+    Orders,
+    RefusedOrderError,
+)
+from tests.evse.simulated import simulate
+from tests.virtual import Car, EvboxChargePoint, Module, Order
+from tests.virtual.evbox_frames import frame
+
+from .ether import Scene
+
+INSTALLATION = 25.0
+type Act = tuple[str, float]
+
+wishes = st.one_of(
+    st.floats(6, INSTALLATION),
+    st.sampled_from([0.0, 6.0, INSTALLATION, 5.9, -1.0, nan, inf, 10_000.0, 25.1]),
+)
+acts = st.one_of(
+    st.tuples(
+        st.sampled_from(["current", "phase", "fail-safe", "fail-safe phase"]), wishes
+    ),
+    st.tuples(st.sampled_from(["pause", "allow"]), st.just(0.0)),
+    st.tuples(st.just("time-out"), st.sampled_from([-1, 0, 1, 9, 60, 600, 10**9])),
+    st.tuples(st.just("wait"), st.sampled_from([0.05, 0.3, 1.2, 5.0, 30.0])),
+    st.tuples(
+        st.sampled_from(["lose", "die", "live", "unplug", "power cycle", "damage"]),
+        st.just(0.0),
+    ),
+    st.tuples(st.just("modules"), st.sampled_from([0.0, 1.0, 3.0])),
+)
+
+
+@dataclass
+class Trial:
+    """One charger, somebody who asks for things, and what was asked last."""
+
+    maximum: float
+    interval: int = 1
+    seed: int = 0
+    allowed: bool = True
+    current: float = 16.0
+    phase: float = inf
+    fail_safe: float = 10.0
+    fail_safe_phase: float = inf
+    answered: int = 0
+    tasks: list[asyncio.Task[None]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        car = Car(max_current=32.0)
+        car.plug_in()
+        self.rng = Random(self.seed)  # noqa: S311 - repeatable on purpose
+        self.point = EvboxChargePoint(
+            1923054,
+            [Module(car), Module()],
+            max_current=self.maximum,
+            min_interval=self.interval,
+        )
+        self.scene = Scene.of(self.point)
+        self.scene.ether.watch = self.judge
+        orders = Orders(
+            limit=CurrentLimit(current=self.current),
+            fail_safe=CurrentLimit(current=self.fail_safe),
+        )
+        self.charger: EvboxCharger = self.scene.add(
+            orders=orders, installation_limit=INSTALLATION, poll_interval=2.0
+        )
+
+    def judge(self, order: Order) -> None:
+        ceiling = min(INSTALLATION, self.maximum)
+        if self.answered < 2:
+            ceiling = min(ceiling, 6.0)
+        for index, sent in enumerate(order.limits):
+            assert sent <= ceiling
+            assert sent <= self.current
+            assert sent <= self.phase or index != 1
+            assert sent == 0 or sent >= 6.0
+            assert self.allowed or sent == 0, "a pause is 0 A on all phases"
+        for index, sent in enumerate(order.fallback):
+            assert sent <= ceiling
+            assert sent <= self.fail_safe
+            assert sent <= self.fail_safe_phase or index != 1
+        assert order.timeout >= 3
+
+    async def ask(self, change: OrderChange) -> None:
+        """Ask for a change; nobody waits for what becomes of it."""
+
+        async def asking() -> None:
+            with suppress(EvseError):
+                await self.charger.change_orders(change)
+
+        self.tasks.append(asyncio.create_task(asking()))
+        await asyncio.sleep(0)
+
+    def usable(self, value: float, *, from_minimum: bool) -> bool:
+        """Return whether a wish may be refused or must be taken."""
+        if not 0 <= value <= INSTALLATION:
+            return False
+        return not from_minimum or value == 0 or value >= 6.0
+
+    async def act(self, what: str, value: float) -> None:
+        await getattr(self, "do_" + what.replace(" ", "_").replace("-", "_"))(value)
+
+    async def do_current(self, value: float) -> None:
+        if self.usable(value, from_minimum=True):
+            self.current = value
+        await self.ask(OrderChange(current=value))
+
+    async def do_phase(self, value: float) -> None:
+        if self.usable(value, from_minimum=True):
+            self.phase = value
+        await self.ask(OrderChange(phases=(None, value, None)))
+
+    async def do_fail_safe(self, value: float) -> None:
+        if self.usable(value, from_minimum=False):
+            self.fail_safe = value
+        await self.ask(OrderChange(fail_safe_current=value))
+
+    async def do_fail_safe_phase(self, value: float) -> None:
+        if self.usable(value, from_minimum=False):
+            self.fail_safe_phase = value
+        await self.ask(OrderChange(fail_safe_phases=(None, value, None)))
+
+    async def do_time_out(self, value: float) -> None:
+        await self.ask(OrderChange(fail_safe_timeout=int(value)))
+
+    async def do_pause(self, _value: float) -> None:
+        self.allowed = False
+        await self.ask(OrderChange(allowed=False))
+
+    async def do_allow(self, _value: float) -> None:
+        self.allowed = True
+        await self.ask(OrderChange(allowed=True))
+
+    async def do_wait(self, value: float) -> None:
+        await asyncio.sleep(value)
+
+    async def do_lose(self, _value: float) -> None:
+        self.point.faults.once("lose")
+
+    async def do_die(self, _value: float) -> None:
+        self.point.faults.dead = True
+
+    async def do_live(self, _value: float) -> None:
+        self.point.faults.dead = False
+
+    async def do_unplug(self, _value: float) -> None:
+        if self.scene.ether.is_open:
+            self.answered = 0
+            self.scene.ether.unplug()
+
+    async def do_power_cycle(self, _value: float) -> None:
+        self.point.power_cycle()
+
+    async def do_damage(self, _value: float) -> None:
+        # The shortest reply, of no modules, has 30 bytes.
+        self.point.faults.once("corrupt", self.rng.randrange(1, 29))
+
+    async def do_modules(self, value: float) -> None:
+        self.point.modules[:] = [Module() for _ in range(int(value))]
+
+    def count_answers(self, data: bytes) -> bytes:
+        self.answered += 1
+        return data
+
+    async def run(self, acts: list[Act]) -> None:
+        async with self.scene:
+            # At most this often was it answered; only what was not counts here.
+            self.scene.ether.damage = self.count_answers
+            for what, value in acts:
+                await self.act(what, value)
+            self.point.faults.dead = False
+            await asyncio.sleep(100.0)
+            for task in self.tasks:
+                assert task.done()
+                # A failed judgement inside the bus would be logged as "unforeseen".
+                task.result()
+
+
+@settings(max_examples=200, suppress_health_check=[HealthCheck.too_slow], deadline=None)
+@given(
+    maximum=st.sampled_from([6.0, 13.0, 20.0, 35.0, 63.0]),
+    interval=st.sampled_from([0, 1, 3, 20]),
+    seed=st.integers(0, 100),
+    steps=st.lists(acts, max_size=25),
+)
+def test_no_order_of_events_puts_too_much_on_the_wire(
+    maximum: float, interval: int, seed: int, steps: list[Act]
+) -> None:
+    trial = Trial(maximum, interval, seed)
+    wrong: list[AssertionError] = []
+
+    def judge(order: Order) -> None:
+        try:
+            trial.judge(order)
+        except AssertionError as error:
+            wrong.append(error)
+
+    trial.scene.ether.watch = judge
+    simulate(trial.run(steps))
+    assert not wrong, wrong[0]
+    # A box that lost its power does not remember when it was last spoken to, and one
+    # whose answer was lost has heard us all the same: never too soon.
+    assert trial.point.counters.too_soon == 0
+    # In the end what was wished for stands, as far as it may be.
+    ceiling = min(INSTALLATION, maximum)
+    wish = min(trial.current, ceiling)
+    expected = wish if trial.allowed and wish >= 6.0 else 0.0
+    last = trial.scene.ether.orders[-1]
+    assert last.limits[0] <= expected
+
+
+@settings(max_examples=200, suppress_health_check=[HealthCheck.too_slow], deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.sampled_from([7.0, 13.0, 20.0, 35.0]), st.floats(0.1, 12.0)),
+        min_size=1,
+        max_size=12,
+    )
+)
+def test_no_request_is_above_what_the_last_two_answers_agree_on(
+    steps: list[tuple[float, float]],
+) -> None:
+    async def scene() -> None:
+        point = EvboxChargePoint(1923054)
+        told: list[float] = []
+        wrong: list[tuple[float, list[float]]] = []
+
+        def tell(data: bytes) -> bytes:
+            # The word after serial number and interval (manual, "Response").
+            told.append(int(data[19:23], 16) / 10)
+            return data
+
+        def judge(order: Order) -> None:
+            highest = max(order.limits + order.fallback)
+            allowed = min(told[-2:]) if len(told) > 1 else 6.0
+            if highest > allowed:
+                wrong.append((highest, told[-2:]))
+
+        stage = Scene.of(point)
+        stage.ether.damage, stage.ether.watch = tell, judge
+        async with stage:
+            stage.add(
+                orders=Orders(
+                    limit=CurrentLimit(current=32.0),
+                    fail_safe=CurrentLimit(current=32.0),
+                )
+            )
+            for maximum, wait in steps:
+                point.max_current = maximum
+                await asyncio.sleep(wait)
+            await asyncio.sleep(12.0)
+        assert wrong == []
+        assert stage.ether.orders[-1].limits[0] == min(point.max_current, 32.0)
+
+    simulate(scene())
+
+
+async def damaged(seed: int, hurt: Callable[[bytearray, Random], None]) -> EvboxCharger:
+    """Have all answers but a few damaged, and look at each reading."""
+    module = Module(
+        energy_wh=5000, currents=(11.0, 12.0, 13.0), cos_phis=(0.9, 0.8, 0.7)
+    )
+    stage = Scene.of(EvboxChargePoint(1923054, [module, Module()]))
+    rng = Random(seed)  # noqa: S311 - repeatable on purpose
+
+    def damage(data: bytes) -> bytes:
+        out = bytearray(data)
+        if rng.random() < 0.4:
+            hurt(out, rng)
+        return bytes(out)
+
+    stage.ether.damage = damage
+    async with stage:
+        charger = stage.add(poll_interval=1.0)
+        shown = 0
+        for _ in range(100):
+            await asyncio.sleep(1.0)
+            if charger.reading is None:
+                continue
+            shown += 1
+            one, two = charger.reading.connectors.values()
+            assert one.current == (11.0, 12.0, 13.0)
+            assert one.cos_phi == (0.9, 0.8, 0.7)
+            assert one.voltage == (230, 230, 230)
+            assert one.energy in {None, 5000}
+            assert two.energy in {None, 0}
+            assert charger.reading.maximum_current in {None, 35.0}
+    assert shown
+    assert charger.statistics.bad_frames
+    return charger
+
+
+def flip(out: bytearray, rng: Random) -> None:
+    out[rng.randrange(len(out))] ^= 1 << rng.randrange(8)
+
+
+def swallow(out: bytearray, rng: Random) -> None:
+    del out[rng.randrange(len(out))]
+
+
+def truncate(out: bytearray, rng: Random) -> None:
+    del out[rng.randrange(1, len(out)) :]
+
+
+def burst(out: bytearray, rng: Random) -> None:
+    start = rng.randrange(len(out) - 8)
+    out[start : start + 8] = rng.randbytes(8)
+
+
+@pytest.mark.parametrize("hurt", [flip, swallow, truncate, burst])
+@pytest.mark.parametrize("seed", range(3))
+def test_no_damaged_frame_makes_a_wrong_value(
+    hurt: Callable[[bytearray, Random], None], seed: int
+) -> None:
+    simulate(damaged(seed, hurt))
+
+
+def fake(out: bytearray, rng: Random) -> None:
+    """Change digits and make the checksums right again: nothing else can tell."""
+    at = rng.randrange(25, len(out) - 5)
+    out[at : at + 1] = b"F"
+    out[:] = frame(out[1:-5].decode())
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_right_checksums_do_not_make_an_impossible_value(seed: int) -> None:
+    async def scene() -> None:
+        rng = Random(seed)  # noqa: S311 - repeatable on purpose
+        module = Module(energy_wh=5000, currents=(11.0, 12.0, 13.0))
+        stage = Scene.of(EvboxChargePoint(1923054, [module, Module()]))
+
+        def damage(data: bytes) -> bytes:
+            out = bytearray(data)
+            if rng.random() < 0.2:
+                fake(out, rng)
+            return bytes(out)
+
+        stage.ether.damage = damage
+        async with stage:
+            charger = stage.add(poll_interval=1.0)
+            for _ in range(300):
+                await asyncio.sleep(1.0)
+                for one in (
+                    charger.reading.connectors.values() if charger.reading else ()
+                ):
+                    assert all(amperes <= 39.5 for amperes in one.current if amperes)
+                    assert all(abs(value) <= 1 for value in one.cos_phi if value)
+                    assert all(volts <= 300 for volts in one.voltage if volts)
+                    assert one.energy is None or one.energy <= 5500
+        assert charger.statistics.implausible
+
+    simulate(scene())
+
+
+@given(
+    st.sampled_from([nan, inf, -inf, -0.1, -6.0, 10_000.0, 32.1, True, "16", None]),
+    st.sampled_from(["current", "fail_safe_current", "phases", "fail_safe_timeout"]),
+)
+def test_absurd_wishes_are_refused_before_anything_is_sent(
+    value: object, what: str
+) -> None:
+    if value is None or (what == "fail_safe_timeout" and value in (10_000.0, 32.1)):
+        return
+    wish = (None, value, None) if what == "phases" else value
+
+    async def scene() -> None:
+        async with Scene.of(EvboxChargePoint(1923054)) as stage:
+            charger = stage.add()
+            await asyncio.sleep(3.0)
+            before = (charger.orders, len(stage.ether.sent))
+            try:
+                await charger.change_orders(OrderChange(**{what: wish}))  # type: ignore[arg-type]
+            except RefusedOrderError:
+                pass
+            else:
+                raise AssertionError("it was taken")
+            assert (charger.orders, len(stage.ether.sent)) == before
+
+    simulate(scene())
