@@ -29,7 +29,7 @@ _SHORTEST: Final = 3
 """Unit, function, checksum: bytes that a frame has at least."""
 _LONGEST: Final = 255
 """Bytes that a frame has at most (Modbus over serial line, 2.5.2.1: 513 signs)."""
-_FRAME: Final = re.compile(rb"[>:]([0-9A-Fa-f]{0,%d})(\r?\n?)" % (2 * _LONGEST))
+_FRAME: Final = re.compile(rb"[>:]([0-9A-Fa-f]{0,%d})(\r\n?)?" % (2 * _LONGEST))
 """A start, and how far a frame can be made of what follows."""
 
 
@@ -128,7 +128,7 @@ class AsciiFramer(Framer[ModbusFrame]):
                     frames.append(frame)
                 else:
                     self.bad += 1
-            elif position == len(buffer) and found[2] != b"\n":
+            elif position == len(buffer):
                 # Its end is still to come.
                 self._buffer = found[0]
                 return frames

@@ -271,8 +271,6 @@ class AblCharger(Charger):
             if raw.state == E0:
                 return Later(0.0, in_turns(self._commands.enable_again))
             self.owes_a1 = False
-        if not self.orders_expired:
-            self._fell_back = False
         if self._must_assert(raw):
             return Later(0.0, in_turns(self._assert))
         if self._tells_icmax is None:
@@ -385,6 +383,7 @@ class AblCharger(Charger):
             async for pause in self.enforce(talk, wanted, starts=starts):
                 yield pause
             self._limit_paused = setpoint.paused and orders.allowed is not False
+            self._fell_back = False
         finally:
             self.end(token)
 
@@ -408,8 +407,9 @@ class AblCharger(Charger):
                 message = f"{self.config.name}: the outlet is disabled, enable it first"
                 raise NotAvailableError(message)
             return True
-        lowers = not is_within(raw.duty, limit_duty(setpoint))
-        if setpoint.paused:
+        duty = limit_duty(setpoint)
+        lowers = not is_within(raw.duty, duty)
+        if setpoint.paused or raw.duty == duty:
             return lowers
         asked = change.current is not None or any(
             phase is not None for phase in change.phases
@@ -427,9 +427,12 @@ class AblCharger(Charger):
         token = self.begin()
         try:
             await self.identify(talk)
+            raw = self.raw or await self.look(talk)
+            if not self._must_assert(raw):
+                # A command of the user came first and did it.
+                return
             duty = limit_duty(self.setpoint)
-            above = self.raw is None or not is_within(self.raw.duty, duty)
-            if above and duty == self._confirmed:
+            if duty == self._confirmed and not is_within(raw.duty, duty):
                 self.statistics.reasserted += 1
             async for pause in self.enforce(talk, lambda: self.setpoint):
                 yield pause

@@ -13,7 +13,7 @@ from ..model import (
 )
 from .duty import PAUSE, current_for
 from .registers import Flags, Info, Reading
-from .states import B1, B2, C3, state_of
+from .states import B1, B2, C3, C4, state_of
 
 SHORTEST_GAP = 10.0
 """Pause between two readings over which energy is always summed, s."""
@@ -22,6 +22,9 @@ GAP_INTERVALS = 3.0
 TOLERATED = 100
 """Above 100 % up to 105 % of Ic nothing ever follows (0x0006, bits 2..0), %."""
 _SECONDS_PER_HOUR = 3600.0
+_CODES = {C4: "F15"}
+_REDUCED_CODES = {C3: "F16/F17"}
+"""Errors that show as a state with another name (annex 3.4)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -133,9 +136,9 @@ def faults_of(told: Told) -> tuple[frozenset[Fault], tuple[str, ...]]:
     state = state_of(told.reading.state)
     found: list[tuple[Fault, str]] = []
     if state.fault is not None:
-        found.append((state.fault, state.name))
+        found.append((state.fault, _CODES.get(told.reading.state, state.name)))
     if told.reading.reduced:
-        code = "F16/F17" if told.reading.state == C3 else "BC3-BC6"
+        code = _REDUCED_CODES.get(told.reading.state, "BC3-BC6")
         found.append((Fault.REDUCED_CURRENT, code))
     if (flags := told.flags) is not None:
         found.extend(

@@ -1,0 +1,240 @@
+"""One box on a wire: who it is, what it says, and when it does not."""
+
+import asyncio
+
+import pytest
+
+from custom_components.evse_bus.evse.model import (
+    Capability,
+    Fault,
+    OrderChange,
+    Status,
+    WrongChargerError,
+)
+from tests.virtual import AblBox, Car
+
+from .scene import LIMIT, Scene, config, orders, until
+
+
+def plugged(**settings: float) -> Car:
+    car = Car(**settings)  # type: ignore[arg-type] # one kind of value is enough
+    car.plug_in()
+    return car
+
+
+@pytest.mark.usefixtures("socket_enabled")
+@pytest.mark.parametrize("tcp", [False, True], ids=["pty", "tcp"])
+async def test_a_car_charges(tcp: bool) -> None:  # noqa: FBT001
+    box = AblBox(1, car=plugged(max_current=12, phases=2, ramp=0.1, reaction=0.0))
+    async with Scene(box, tcp=tcp) as scene:
+        charger = await scene.settled(config(), orders(10))
+        await until(
+            lambda: (
+                charger.reading
+                and charger.reading.connectors[1].estimated_power == 2 * 10.0 * 230
+            )
+        )
+        assert charger.reading is not None
+        connector = charger.reading.connectors[1]
+        assert connector.status is Status.CHARGING
+        assert connector.raw_state == "C2"
+        assert (connector.plugged, connector.charging) == (True, True)
+        assert connector.current == (10.0, 10.0, 0.0)
+        assert connector.estimated_energy is not None
+        assert charger.reading.offered_current == 9.96
+        assert charger.reading.allowed is True
+        assert not charger.faults
+        assert charger.info is not None
+        assert charger.info.serial == "2W22xy01234567"
+        assert charger.info.firmware == "1.2"
+        assert charger.info.options["enable_after_power_cycle"] is True
+        assert Capability.CURRENT in charger.capabilities
+        # The box came with 16 A and was brought down, once.
+        assert scene.writes() == [166]
+        assert scene.bus.wire.statistics.bad_frames == 0
+
+
+async def test_a_box_without_a_meter_has_no_currents() -> None:
+    box = AblBox(1, car=plugged(), meter=False)
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders())
+        assert charger.reading is not None
+        connector = charger.reading.connectors[1]
+        assert connector.current == (None, None, None)
+        assert connector.estimated_power is None
+        assert connector.estimated_energy is None
+        assert Capability.CURRENT not in charger.capabilities
+        assert Capability.ESTIMATED_ENERGY not in charger.capabilities
+
+
+async def test_currents_in_b2_are_zero_though_not_told() -> None:
+    car = Car()
+    box = AblBox(1, car=car)
+    box.unreadable_in_b2 = True
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders())
+        car.plug_in(request=False)
+        await until(
+            lambda: charger.reading and charger.reading.connectors[1].raw_state == "B2"
+        )
+        assert charger.reading is not None
+        assert charger.reading.connectors[1].status is Status.SUSPENDED_EV
+        assert charger.reading.connectors[1].current == (0, 0, 0)
+
+
+async def test_nothing_is_written_to_a_box_that_stands_within_its_orders() -> None:
+    async with Scene(AblBox(1, default_current=10)) as scene:
+        await scene.settled(config(), orders(16))
+        assert scene.writes() == []
+
+
+async def test_a_sleeping_box_is_asked_again_in_its_time() -> None:
+    async with Scene(AblBox(1, sleep_after=5)) as scene:
+        charger = scene.add(config(), orders(), quick=False)
+        await until(lambda: charger.available)
+        first, second = [one.t for one in scene.requests()[:2]]
+        assert 0.5 <= second - first <= 1.0
+        assert charger.misses == 0
+        assert charger.statistics.timeouts == 1
+
+
+async def test_a_command_wakes_a_sleeping_box() -> None:
+    async with Scene(AblBox(1, sleep_after=1.5)) as scene:
+        charger = scene.add(config(poll_interval=60), orders(), quick=False)
+        await until(lambda: charger.available and scene.boxes[0].asleep)
+        await charger.change_orders(OrderChange(current=8))
+        assert scene.writes() == [133]
+        assert scene.boxes[0].lost_asleep == 2
+
+
+async def test_optional_registers_are_no_miss() -> None:
+    silent, telling = AblBox(1), AblBox(2, extra_registers=True)
+    async with Scene(silent, telling) as scene:
+        one = await scene.settled(config(1), orders(10))
+        two = await scene.settled(config(2), orders(10))
+        for charger in (one, two):
+            await scene.polled(charger, 3)
+            assert charger.available
+            assert charger.misses == 0
+        assert one.reading is not None
+        assert one.reading.details["icmax_duty"] is None
+        # Asked once, not with every poll.
+        assert len(scene.reads(1, 0x0F)) == 1
+        two.forget()
+        await until(lambda: two.reading and two.reading.details["icmax_duty"] == 16.6)
+
+
+async def test_an_answer_to_another_request_changes_nothing() -> None:
+    async with Scene(AblBox(1)) as scene:
+        charger = await scene.settled(config(), orders())
+        scene.boxes[0].answer_register = 0x33
+        before = scene.bus.wire.statistics.foreign_frames
+        await until(lambda: not charger.available)
+        assert charger.reading is None
+        assert scene.bus.wire.statistics.foreign_frames >= before + 3
+        scene.boxes[0].answer_register = None
+        await until(lambda: charger.available)
+
+
+async def test_a_dead_box_is_gone_and_comes_back() -> None:
+    async with Scene(AblBox(1)) as scene:
+        charger = await scene.settled(config(), orders(10))
+        scene.boxes[0].faults.dead = True
+        await until(lambda: not charger.available)
+        assert charger.reading is None
+        scene.boxes[0].power_cycle()
+        scene.boxes[0].faults.clear()
+        await until(lambda: charger.available and scene.boxes[0].ic_amps < 10)
+        # Serial number and information were read anew before the limit was written.
+        registers = [one.register for one in scene.requests()]
+        assert registers.count(0x50) == 2
+        last = len(registers) - 1 - registers[::-1].index(0x50)
+        assert LIMIT in registers[last:]
+
+
+async def test_the_wrong_box_is_told_nothing() -> None:
+    box = AblBox(1, serial="2W22xy99999999")
+    async with Scene(box) as scene:
+        charger = scene.add(config(serial="2W22xy01234567"), orders(6))
+        await until(lambda: Fault.WRONG_CHARGER in charger.faults)
+        with pytest.raises(WrongChargerError, match="2W22xy99999999") as caught:
+            await charger.change_orders(OrderChange(current=8))
+        assert caught.value.expected == "2W22xy01234567"
+        with pytest.raises(WrongChargerError):
+            await charger.change_orders(OrderChange(allowed=False))
+        assert charger.reading is None
+        assert not charger.available
+        assert scene.writes() == []
+        # The right one is there again.
+        box.serial = "2W22xy01234567"
+        await until(lambda: charger.available and box.outlet.icmax == 1000)
+        assert Fault.WRONG_CHARGER not in charger.faults
+
+
+async def test_a_box_exchanged_while_the_adapter_was_away() -> None:
+    box = AblBox(1)
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders())
+        scene.virtual.unplug()
+        await until(lambda: not scene.bus.connected)
+        box.serial = "2W22xy99999999"
+        scene.virtual.replug()
+        # No serial number was set up: the one that was found first counts.
+        await until(lambda: Fault.WRONG_CHARGER in charger.faults)
+        with pytest.raises(WrongChargerError):
+            await charger.change_orders(OrderChange(current=6))
+        assert scene.writes() == []
+
+
+async def test_a_box_exchanged_between_two_answers() -> None:
+    box = AblBox(1)
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders())
+        box.faults.dead = True
+        await until(lambda: charger.misses == 1)
+        box.serial = "2W22xy99999999"
+        box.faults.clear()
+        await until(lambda: Fault.WRONG_CHARGER in charger.faults)
+        assert not charger.available
+
+
+async def test_a_second_box_with_the_same_id_is_noticed() -> None:
+    async with Scene(AblBox(1, jitter=0.0)) as scene:
+        charger = await scene.settled(config(), orders())
+        scene.virtual.add(
+            AblBox(1, serial="2W22xy99999999", turn_round=0.003, jitter=0.0)
+        )
+        await until(lambda: Fault.DUPLICATE_ADDRESS in charger.faults)
+        scene.virtual.remove(scene.virtual.devices[-1])
+        await until(lambda: Fault.DUPLICATE_ADDRESS not in charger.faults)
+
+
+async def test_echo_noise_and_errors_are_never_misread() -> None:
+    box = AblBox(1, default_current=16)
+    async with Scene(box) as scene:
+        scene.virtual.faults.echo = True
+        charger = await scene.settled(config(poll_interval=0.0), orders(10))
+        scene.virtual.faults.noise_rate = 5
+        box.faults.byte_error_rate = 0.001
+        seen = set()
+
+        def note() -> None:
+            if charger.reading is not None:
+                seen.add(charger.reading.offered_current)
+
+        charger.subscribe(note)
+        await scene.polled(charger, 25)
+        assert seen <= {9.96}
+        assert set(scene.writes(LIMIT)) == {166}
+        assert charger.statistics.bad_frames
+
+
+async def test_two_boxes_do_not_mix() -> None:
+    async with Scene(AblBox(1), AblBox(2, serial="2W22xy00000002")) as scene:
+        one = await scene.settled(config(1), orders(10))
+        two = await scene.settled(config(2), orders(8))
+        await asyncio.gather(
+            one.change_orders(OrderChange(current=9)),
+            two.change_orders(OrderChange(current=7)),
+        )
+        assert [box.limits_written for box in scene.boxes] == [[166, 150], [133, 116]]
