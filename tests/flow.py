@@ -21,6 +21,7 @@ from homeassistant.data_entry_flow import (
     FlowResultType,
     section,
 )
+from homeassistant.helpers import config_validation as cv
 from homeassistant.helpers.selector import SelectSelector
 import probatio as vol
 
@@ -153,6 +154,11 @@ class Flow:
         self._take(await self.manager.async_configure(self.flow_id))
         return self
 
+    async def reload(self) -> Flow:
+        """Ask for the present step again, as a page does that is loaded again."""
+        self._take(await self.manager.async_configure(self.flow_id))
+        return self
+
     def abort(self) -> None:
         """Close the dialogue."""
         self.manager.async_abort(self.flow_id)
@@ -182,6 +188,10 @@ class Flow:
             for error in (result["errors"] or {}).values():
                 self._text(self.texts["error"][error], given)
             if result["data_schema"] is not None:
+                # As the frontend gets it; raises for what cannot be told to it.
+                vol.to_field_list(
+                    result["data_schema"], custom_serializer=cv.custom_serializer
+                )
                 self._fields(result["data_schema"], texts, given)
 
     def _step_texts(self, given: Mapping[str, str]) -> dict[str, Any]:

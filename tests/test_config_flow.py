@@ -64,6 +64,8 @@ async def test_abl_boxes_are_found_and_added(hass: HomeAssistant) -> None:
             )
         )
 
+        # Nothing is taken for a confirmation that is none.
+        await flow.reload()
         assert flow.step == "confirm_abl"
         table = flow.result["description_placeholders"]["chargers"]
         assert table == "| Left | 5 | 13 A | 6 A |\n| Right | 16 | 10 A | 8 A |"

@@ -78,6 +78,7 @@ async def test_single_evbox_is_found_with_confirmed_values_only(
             },
         }
         await flow.submit(charger("Garage", 20, fail_safe_timeout=90))
+        await flow.reload()
         assert flow.step == "confirm_evbox"
         table = flow.result["description_placeholders"]["chargers"]
         assert table == "| Garage | 01923054 | 20 A | 6 A | 90 s |"

@@ -39,7 +39,7 @@ from .flow_schema import (
 )
 
 if TYPE_CHECKING:
-    from homeassistant.config_entries import ConfigSubentry
+    from homeassistant.config_entries import ConfigSubentry, ConfigSubentryData
 
     from .evse.model import FoundCharger
     from .evse.protocol import Protocol
@@ -236,3 +236,17 @@ def charger_suggestions(protocol: Protocol, subentry: ConfigSubentry) -> dict[st
     if stored.get(CONF_SERIAL) is not None:
         suggestions[CONF_SERIAL] = stored[CONF_SERIAL]
     return suggestions
+
+
+def confirm_row(protocol: Protocol, charger: ConfigSubentryData) -> str:
+    """Return a new charger as a row of the table that is confirmed last."""
+    data = charger["data"]
+    cells = [
+        charger["title"].replace("|", "/"),
+        ADDRESSES[protocol.key].show(data[CONF_ADDRESS]),
+        f"{data[CONF_INSTALLATION_LIMIT]:g} A",
+        f"{data[CONF_FAIL_SAFE_CURRENT]:g} A",
+    ]
+    if CONF_FAIL_SAFE_TIMEOUT in data:
+        cells.append(f"{data[CONF_FAIL_SAFE_TIMEOUT]} s")
+    return f"| {' | '.join(cells)} |"

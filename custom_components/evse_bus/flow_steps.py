@@ -10,8 +10,6 @@ from homeassistant.const import CONF_ADDRESS, CONF_DEVICE, CONF_NAME
 from homeassistant.data_entry_flow import FlowContext, FlowHandler, FlowResult
 
 from .const import (
-    CONF_FAIL_SAFE_CURRENT,
-    CONF_FAIL_SAFE_TIMEOUT,
     CONF_INSTALLATION_LIMIT,
     SUBENTRY_CHARGER,
 )
@@ -22,6 +20,7 @@ from .flow_charger import (
     charger_data,
     charger_form,
     check_charger,
+    confirm_row,
     default_name,
 )
 from .flow_scan import error_key
@@ -310,20 +309,11 @@ class ChargerSteps[
 
     # -- What happens when we fall silent ----------------------------------------
 
-    def _confirm(self) -> ResultT:
-        address = ADDRESSES[self.protocol.key]
-        rows = []
-        for one in self._ready:
-            data = one["data"]
-            cells = [
-                one["title"].replace("|", "/"),
-                address.show(data[CONF_ADDRESS]),
-                f"{data[CONF_INSTALLATION_LIMIT]:g} A",
-                f"{data[CONF_FAIL_SAFE_CURRENT]:g} A",
-            ]
-            if CONF_FAIL_SAFE_TIMEOUT in data:
-                cells.append(f"{data[CONF_FAIL_SAFE_TIMEOUT]} s")
-            rows.append(f"| {' | '.join(cells)} |")
+    def _confirm(self, user_input: dict[str, Any] | None = None) -> ResultT:
+        # A page that is loaded again asks for the step without having confirmed.
+        if user_input is not None:
+            return self.finish(self._ready)
+        rows = (confirm_row(self.protocol, one) for one in self._ready)
         return self.async_show_form(
             step_id=f"confirm_{self.protocol.key}",
             description_placeholders={"chargers": "\n".join(rows)},
@@ -331,15 +321,13 @@ class ChargerSteps[
         )
 
     async def async_step_confirm_evbox(
-        self,
-        user_input: dict[str, Any] | None = None,  # noqa: ARG002
+        self, user_input: dict[str, Any] | None = None
     ) -> ResultT:
         """Store, now that the user knows an EVBox's fail-safe."""
-        return self.finish(self._ready)
+        return self._confirm(user_input)
 
     async def async_step_confirm_abl(
-        self,
-        user_input: dict[str, Any] | None = None,  # noqa: ARG002
+        self, user_input: dict[str, Any] | None = None
     ) -> ResultT:
         """Store, now that the user knows that an ABL box has none."""
-        return self.finish(self._ready)
+        return self._confirm(user_input)
