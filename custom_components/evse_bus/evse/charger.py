@@ -48,6 +48,8 @@ class Charger(ABC):
     """One charger on a bus."""
 
     timing: ClassVar[Timing]
+    orders_keep_alive: ClassVar[bool] = False
+    """Imposing orders meets the deadline of the regular exchange as well."""
 
     def __init__(self, config: ChargerConfig, orders: Orders) -> None:
         """Take the orders that stand; nothing is sent before the bus starts."""
@@ -70,6 +72,7 @@ class Charger(ABC):
         self.slot = Slot(kind=Kind.PROBE)
         self.bus: Bus | None = None
         self._renewed: float | None = None
+        self._clamped: tuple[tuple[Orders, Limits], Setpoint] | None = None
         self._listeners: list[Callable[[], None]] = []
 
     # -- What it is and has ------------------------------------------------------
@@ -92,7 +95,11 @@ class Charger(ABC):
     @property
     def setpoint(self) -> Setpoint:
         """Return what may be sent now."""
-        return clamp(self.effective_orders, self.limits)
+        asked = (self.effective_orders, self.limits)
+        # Asked for with every poll, and hardly ever another one.
+        if self._clamped is None or self._clamped[0] != asked:
+            self._clamped = (asked, clamp(*asked))
+        return self._clamped[1]
 
     @property
     def told(self) -> tuple[object, ...]:
@@ -214,6 +221,7 @@ class Charger(ABC):
             kind=Kind.PAUSE if pause else Kind.COMMAND,
             due=loop.time(),
             worst_case=bus.worst_case(self),
+            meets=self.slot if self.orders_keep_alive else None,
             step=_nothing,
             persistence=Persistence.STANDING,
             merge_key=_merge_key(checked),

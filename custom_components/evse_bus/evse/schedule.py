@@ -43,6 +43,8 @@ class Slot:
     """Longest time one turn can take, time-out included, s."""
     served: float = field(default=-inf)
     """When it last had a turn."""
+    meets: Slot | None = None
+    """A slot whose deadline this turn meets as well: it does not stand in the way."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +112,7 @@ def _leaves_room(slot: Slot, deadlines: Iterable[Slot], now: float) -> bool:
     for other in deadlines:
         latest = max(other.start_by, other.ready)
         # One that is late already blocks nobody: a pause must still get through.
-        if other is slot or latest < now:
+        if other is slot or other is slot.meets or latest < now:
             continue
         start = max(end, other.ready)
         if start > latest:

@@ -309,6 +309,22 @@ def test_a_time_out_below_three_intervals_is_raised(
     simulate(scene())
 
 
+def test_a_short_time_out_leaves_room_for_commands() -> None:
+    async def scene() -> None:
+        point = box(min_interval=1)
+        async with Scene.of(point) as stage:
+            charger = stage.add(orders=replace(ORDERS, fail_safe_timeout=1))
+            await asyncio.sleep(10.0)
+            for current in (10.0, 12.0, 14.0):
+                asked = now()
+                await charger.change_orders(OrderChange(current=current))
+                assert now() - asked < 1.6
+                await asyncio.sleep(5.0)
+        assert point.counters.fail_backs == 0
+
+    simulate(scene())
+
+
 def test_lost_answers_are_asked_for_again_before_the_time_out() -> None:
     async def scene() -> None:
         point = box(min_interval=1)

@@ -101,10 +101,13 @@ class Trial:
             assert sent <= self.fail_safe_phase or index != 1
         assert order.timeout >= 3
 
-    async def ask(self, change: OrderChange) -> None:
+    async def ask(self, change: OrderChange, **wished: float | bool) -> None:
         """Ask for a change; nobody waits for what becomes of it."""
 
         async def asking() -> None:
+            # From this moment on the wire is judged by it.
+            for name, value in wished.items():
+                setattr(self, name, value)
             with suppress(EvseError):
                 await self.charger.change_orders(change)
 
@@ -121,35 +124,34 @@ class Trial:
         await getattr(self, "do_" + what.replace(" ", "_").replace("-", "_"))(value)
 
     async def do_current(self, value: float) -> None:
-        if self.usable(value, from_minimum=True):
-            self.current = value
-        await self.ask(OrderChange(current=value))
+        taken = self.usable(value, from_minimum=True)
+        await self.ask(
+            OrderChange(current=value), **({"current": value} if taken else {})
+        )
 
     async def do_phase(self, value: float) -> None:
-        if self.usable(value, from_minimum=True):
-            self.phase = value
-        await self.ask(OrderChange(phases=(None, value, None)))
+        taken = self.usable(value, from_minimum=True)
+        change = OrderChange(phases=(None, value, None))
+        await self.ask(change, **({"phase": value} if taken else {}))
 
     async def do_fail_safe(self, value: float) -> None:
-        if self.usable(value, from_minimum=False):
-            self.fail_safe = value
-        await self.ask(OrderChange(fail_safe_current=value))
+        taken = self.usable(value, from_minimum=False)
+        change = OrderChange(fail_safe_current=value)
+        await self.ask(change, **({"fail_safe": value} if taken else {}))
 
     async def do_fail_safe_phase(self, value: float) -> None:
-        if self.usable(value, from_minimum=False):
-            self.fail_safe_phase = value
-        await self.ask(OrderChange(fail_safe_phases=(None, value, None)))
+        taken = self.usable(value, from_minimum=False)
+        change = OrderChange(fail_safe_phases=(None, value, None))
+        await self.ask(change, **({"fail_safe_phase": value} if taken else {}))
 
     async def do_time_out(self, value: float) -> None:
         await self.ask(OrderChange(fail_safe_timeout=int(value)))
 
     async def do_pause(self, _value: float) -> None:
-        self.allowed = False
-        await self.ask(OrderChange(allowed=False))
+        await self.ask(OrderChange(allowed=False), allowed=False)
 
     async def do_allow(self, _value: float) -> None:
-        self.allowed = True
-        await self.ask(OrderChange(allowed=True))
+        await self.ask(OrderChange(allowed=True), allowed=True)
 
     async def do_wait(self, value: float) -> None:
         await asyncio.sleep(value)

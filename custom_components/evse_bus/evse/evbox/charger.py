@@ -79,6 +79,7 @@ class EvboxCharger(Charger):
     """One ChargePoint with its 0 to 20 ChargeBox modules."""
 
     timing = TIMING
+    orders_keep_alive = True
 
     def __init__(self, config: EvboxConfig, orders: Orders) -> None:
         """Take the orders that stand; the first poll imposes them, up to 6 A."""
