@@ -95,7 +95,11 @@ def _number(device: Device) -> int:
 
 def _car(options: argparse.Namespace, index: int) -> Car:
     """Make the car of one connector; each has its own dice and habits."""
-    life = CarLife(seed=options.seed * 1000 + index)
+    life = CarLife(
+        seed=options.seed * 1000 + index,
+        away=tuple(options.away),
+        wants_wh=tuple(options.wants),
+    )
     car = Car(
         max_current=(16.0, 32.0, 20.0)[index % 3],
         phases=(3, 3, 1)[index % 3],
@@ -189,6 +193,18 @@ def _common(add: Callable[..., object]) -> None:
     add("--baud", type=int)
     add("--parity", choices=["N", "E", "O"])
     add("--cars", choices=["auto", "plugged", "none"], default="none")
+    for name, unit, usual in (
+        ("away", "seconds", CarLife.away),
+        ("wants", "Wh", CarLife.wants_wh),
+    ):
+        add(
+            f"--{name}",
+            type=float,
+            nargs=2,
+            default=usual,
+            metavar=("MIN", "MAX"),
+            help=f"{unit}, of cars that come and go by themselves",
+        )
     add(
         "--time-scale", type=float, default=1.0, help="cars and time-outs, not the wire"
     )

@@ -9,6 +9,7 @@ from pathlib import Path
 import signal
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -60,6 +61,15 @@ def test_abl(tmp_path: Path) -> None:
     assert counters["devices"]["abl-1"]["requests"] == 2
     assert counters["devices"]["abl-2"]["requests"] == 0
     assert not link.exists()
+
+
+def test_cars_that_come_and_go() -> None:
+    """Sooner than any would come of itself."""
+    arguments = ["--cars", "auto", "--away", "0", "0"]
+    with running("abl", *arguments) as (_, url), RawClient(url, "E") as client:
+        deadline = time.monotonic() + 4
+        while client.ask(READ_FULL)[9:11] not in (b"B1", b"B2", b"C2"):
+            assert time.monotonic() < deadline
 
 
 @pytest.mark.usefixtures("socket_enabled")
