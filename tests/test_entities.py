@@ -12,7 +12,7 @@ from tests.virtual import AblBox, EvboxChargePoint
 from tests.virtual.device import Device
 
 # What depends on when one looks, or on what flowed meanwhile.
-UNSTEADY = ("round_trip", "utilisation", "requests", "timeouts")
+UNSTEADY = ("round_trip", "utilisation", "requests", "timeouts", "reasserted")
 
 
 def boxes(protocol: str) -> tuple[Device, str]:
@@ -34,6 +34,10 @@ async def test_entities(
     ):
         energy = await get_entity(hass, "sensor", entry, last)
         await wait_for_state(hass, energy, lambda state: float(state.state) >= 0)
+        if protocol == "abl":
+            # Read back above the order, it is brought down right away.
+            offered = await get_entity(hass, "sensor", entry, "offered_current")
+            await wait_for_state(hass, offered, "6.0")
         await hass.async_block_till_done()
         registry = er.async_get(hass)
         entries = er.async_entries_for_config_entry(registry, entry.entry_id)
