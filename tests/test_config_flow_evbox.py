@@ -182,6 +182,33 @@ async def test_nobody_answers_an_evbox_search(hass: HomeAssistant) -> None:
         flow.abort()
 
 
+@pytest.mark.parametrize(
+    ("search", "addresses", "step"),
+    [
+        # Everybody was asked: then several may have answered at once.
+        ("search_single", {}, "duplicates"),
+        ("search_addresses", {"serial_numbers": ["42"]}, "unreadable"),
+    ],
+)
+async def test_answers_that_nobody_can_read(
+    hass: HomeAssistant, search: str, addresses: dict[str, Any], step: str
+) -> None:
+    box = EvboxChargePoint(42, min_interval=0)
+    with VirtualBus.pty(box) as bus:
+        box.faults.once("corrupt")
+        box.faults.once("corrupt")
+        flow = await port_step(hass, "evbox", bus.url)
+        await flow.choose(search)
+        await flow.submit(IMPOSED | addresses)
+        await flow.wait()
+        assert flow.step == step
+        assert flow.result["menu_options"] == ["scan", "impose", "manual", "port"]
+        await flow.choose("scan")
+        await flow.wait()
+        assert flow.step == "select"
+        flow.abort()
+
+
 async def test_evbox_typed_in_without_a_word_on_the_wire(hass: HomeAssistant) -> None:
     with VirtualBus.pty(EvboxChargePoint(1923054)) as bus:
         flow = await port_step(hass, "evbox", bus.url)

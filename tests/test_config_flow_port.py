@@ -11,8 +11,10 @@ from homeassistant.data_entry_flow import FlowResultType
 import pytest
 from pytest_homeassistant_custom_component.common import MockConfigEntry
 
+from custom_components.evse_bus.config_flow import EvseBusConfigFlow
 from custom_components.evse_bus.const import DOMAIN
 from custom_components.evse_bus.evse.protocols import PROTOCOLS
+from custom_components.evse_bus.subentry_flow import ChargerSubentryFlow
 from tests.flow import IMPOSED, NOWHERE, charger, english, port_step
 from tests.virtual import (
     EvboxChargePoint,
@@ -146,6 +148,15 @@ async def test_another_network_port_is_another_bus(hass: HomeAssistant) -> None:
     flow = await port_step(hass, "evbox", NOWHERE)
     assert flow.errors == {"base": "port_missing"}
     flow.abort()
+
+
+def test_every_text_belongs_to_a_step() -> None:
+    for texts, flow in (
+        (english()["config"], EvseBusConfigFlow),
+        (english()["config_subentries"]["charger"], ChargerSubentryFlow),
+    ):
+        for step in texts["step"]:
+            assert hasattr(flow, f"async_step_{step}")
 
 
 def test_protocols_say_how_they_use_the_line() -> None:
