@@ -1,0 +1,165 @@
+"""The dashboard "Chargers", built of the entities that are there. Pure."""
+
+from collections.abc import Iterable
+from typing import Any, Final
+
+from .listing import ListedBus, ListedCharger, Part
+
+TITLE: Final = "Chargers"
+URL_PATH: Final = "evse-chargers"
+ICON: Final = "mdi:ev-station"
+
+FULL: Final = 12
+HALF: Final = 6
+THIRD: Final = 4
+"""Columns of a section's twelve."""
+HISTORY_HOURS: Final = 0.25
+
+type Card = dict[str, Any]
+
+
+def dashboard(buses: Iterable[ListedBus]) -> dict[str, Any]:
+    """Return a dashboard: a section for each charger, and what has happened."""
+    buses = list(buses)
+    chargers = [charger for bus in buses for charger in bus.chargers]
+    view = {
+        "type": "sections",
+        "title": TITLE,
+        "path": "chargers",
+        "icon": ICON,
+        "max_columns": 4,
+        "dense_section_placement": True,
+        "badges": [
+            {
+                "type": "entity",
+                "entity": connected,
+                "name": bus.name,
+                "show_name": True,
+                "show_state": True,
+            }
+            for bus in buses
+            if (connected := bus.find("connected"))
+        ],
+        "sections": [
+            *(_charger_section(charger) for charger in chargers),
+            _history_section(chargers),
+        ],
+    }
+    return {"views": [view]}
+
+
+def _charger_section(charger: ListedCharger) -> Card:
+    cards = [
+        _heading(charger.name, ICON, "title", charger.find("problem")),
+        _tile(
+            charger.find("charging_current"),
+            FULL,
+            name="Charging current",
+            icon="mdi:speedometer",
+            features=[{"type": "numeric-input", "style": "slider"}],
+        ),
+        _tile(
+            charger.find("charging_allowed"),
+            FULL,
+            name="Charging allowed",
+            features=[{"type": "toggle"}],
+            features_position="inline",
+        ),
+    ]
+    several = len(charger.connectors) > 1
+    for connector in charger.connectors.values():
+        if several:
+            cards.append(_heading(connector.name, "mdi:ev-plug-type2", "subtitle"))
+        cards += _connector_cards(connector)
+    return _section(cards)
+
+
+def _connector_cards(connector: Part) -> list[Card | None]:
+    return [
+        # An EVBox module does not tell its status, but whether current flows.
+        _tile(
+            connector.find("status", "charging"),
+            HALF,
+            name="Status",
+            icon="mdi:car-electric",
+            color="green",
+        ),
+        _tile(
+            connector.find("power", "estimated_power"),
+            HALF,
+            name="Power" if "power" in connector.entities else "Power (estimated)",
+            icon="mdi:flash",
+            color="amber",
+        ),
+        *(
+            _tile(
+                connector.find(f"current_{phase}"),
+                THIRD,
+                name=phase.upper(),
+                color="light-blue",
+            )
+            for phase in ("l1", "l2", "l3")
+        ),
+    ]
+
+
+def _history_section(chargers: Iterable[ListedCharger]) -> Card:
+    parts = [
+        (
+            f"{charger.name} {number}" if len(charger.connectors) > 1 else charger.name,
+            connector,
+        )
+        for charger in chargers
+        for number, connector in charger.connectors.items()
+    ]
+    power = _graph(parts, ("power", "estimated_power"))
+    status = _graph(parts, ("status", "charging"))
+    cards = [
+        _heading("The last quarter of an hour", "mdi:chart-line", "title"),
+        power and {**power, "title": "Power"},
+        status and {**status, "title": "Status"},
+    ]
+    return _section(cards)
+
+
+def _graph(parts: Iterable[tuple[str, Part]], keys: tuple[str, ...]) -> Card | None:
+    lines = [
+        {"entity": entity, "name": name}
+        for name, part in parts
+        if (entity := part.find(*keys))
+    ]
+    if not lines:
+        return None
+    return {
+        "type": "history-graph",
+        "entities": lines,
+        "hours_to_show": HISTORY_HOURS,
+        "grid_options": {"columns": FULL},
+    }
+
+
+def _section(cards: Iterable[Card | None]) -> Card:
+    return {"type": "grid", "cards": [card for card in cards if card]}
+
+
+def _heading(name: str, icon: str, style: str, badge: str | None = None) -> Card:
+    card: Card = {
+        "type": "heading",
+        "heading": name,
+        "icon": icon,
+        "heading_style": style,
+    }
+    if badge is not None:
+        card["badges"] = [{"type": "entity", "entity": badge, "show_icon": True}]
+    return card
+
+
+def _tile(entity: str | None, columns: int, **options: Any) -> Card | None:  # noqa: ANN401
+    if entity is None:
+        return None
+    return {
+        "type": "tile",
+        "entity": entity,
+        "grid_options": {"columns": columns},
+        **options,
+    }

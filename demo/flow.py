@@ -1,0 +1,91 @@
+"""A person at a config flow: looks at each step and fills it in."""
+
+import asyncio
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from typing import Any, Final
+
+from .buses import Answer
+from .client import Client
+from .settings import DemoError
+
+FLOWS: Final = "config/config_entries/flow"
+GLANCE: Final = 0.2
+"""Seconds between two looks at a step that takes a while."""
+
+
+def fill(fields: Iterable[Mapping[str, Any]], values: Mapping[str, Any]) -> Any:  # noqa: ANN401
+    """Return a form as somebody leaves it who changes only those values.
+
+    ``fields``: as Home Assistant sends a form to its frontend. A field without a
+    suggestion, a default or a value stays empty.
+    """
+    typed: dict[str, Any] = {}
+    for field in fields:
+        name = field["name"]
+        suggested = (field.get("description") or {}).get("suggested_value")
+        if field.get("type") == "expandable":
+            typed[name] = fill(field["schema"], values.get(name, {}))
+        elif name in values:
+            typed[name] = values[name]
+        elif suggested is not None:
+            typed[name] = suggested
+        elif field.get("default") is not None:
+            typed[name] = field["default"]
+    return typed
+
+
+async def add_entry(
+    client: Client,
+    domain: str,
+    answers: Mapping[str, Answer],
+    waiting: Callable[[str], None],
+) -> bool:
+    """Go through a config flow; return whether it was not there already.
+
+    ``waiting`` is told which step takes a while. Raises DemoError.
+    """
+    step = await client.post(FLOWS, {"handler": domain})
+    flow = f"{FLOWS}/{step['flow_id']}"
+    while step["type"] != "create_entry":
+        if step["type"] == "abort":
+            if step["reason"] == "already_configured":
+                return False
+            raise DemoError(f"The config flow gave up: {step['reason']}")
+        try:
+            step = await _next(client, flow, step, answers, waiting)
+        except BaseException:
+            # A flow left open would be found by the next person.
+            with suppress(DemoError):
+                await client.delete(flow)
+            raise
+    return True
+
+
+async def _next(
+    client: Client,
+    flow: str,
+    step: Mapping[str, Any],
+    answers: Mapping[str, Answer],
+    waiting: Callable[[str], None],
+) -> Mapping[str, Any]:
+    name = step["step_id"]
+    if step["type"] in ("progress", "progress_done"):
+        waiting(name)
+        await asyncio.sleep(GLANCE)
+        return _mapping(await client.get(flow))
+    if step.get("errors"):
+        raise DemoError(f"The config flow refused step {name}: {step['errors']}")
+    if name not in answers:
+        raise DemoError(f"The config flow came to step {name}, which has no answer")
+    answer = answers[name]
+    typed = answer(step) if callable(answer) else answer
+    if step["type"] == "form":
+        typed = fill(step["data_schema"] or (), typed)
+    return _mapping(await client.post(flow, typed))
+
+
+def _mapping(answer: Any) -> Mapping[str, Any]:  # noqa: ANN401 - as the API answers
+    if not isinstance(answer, dict):
+        raise DemoError(f"The config flow answered {answer!r}")
+    return answer

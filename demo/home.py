@@ -1,0 +1,113 @@
+"""Makes a fresh Home Assistant the demo's: buses, first limits, dashboard."""
+
+import asyncio
+from collections.abc import Mapping
+import json
+from typing import Any, Final
+
+from .buses import BUSES, DemoBus
+from .client import Client
+from .dashboard import ICON, TITLE, URL_PATH, dashboard
+from .flow import add_entry
+from .listing import DOMAIN, ListedBus, list_buses
+from .say import Progress, say
+from .settings import DemoError, Settings
+
+PATIENCE: Final = 60.0
+"""Seconds that all chargers get to show all their connectors."""
+GLANCE: Final = 0.5
+
+
+async def furnish(client: Client, settings: Settings) -> None:
+    """Add what is missing."""
+    new = [bus for bus in BUSES if await _add_bus(client, settings, bus)]
+    if new:
+        buses = await _all_listed(client)
+        for bus in new:
+            await _first_limits(client, bus, buses)
+    else:
+        buses = await _listed(client)
+    await _show_dashboard(client, settings, buses)
+
+
+async def _add_bus(client: Client, settings: Settings, bus: DemoBus) -> bool:
+    port = str(settings.link(bus.protocol))
+    with Progress(f"{bus.title}: going through the config flow") as progress:
+        return await add_entry(client, DOMAIN, bus.answers(port), progress.show)
+
+
+async def _listed(client: Client) -> list[ListedBus]:
+    return list_buses(
+        await client.command("config/entity_registry/list"),
+        await client.command("config/device_registry/list"),
+    )
+
+
+async def _all_listed(client: Client) -> list[ListedBus]:
+    """Wait for the chargers' first answers, which tell how many connectors they have."""
+    expected = sum(bus.connectors for bus in BUSES)
+    with Progress("Chargers: waiting for their first answers") as progress:
+        while True:
+            buses = await _listed(client)
+            listed = sum(
+                len(charger.connectors) for bus in buses for charger in bus.chargers
+            )
+            if listed >= expected:
+                return buses
+            if progress.seconds > PATIENCE:
+                say(f"only {listed} of {expected} connectors have answered")
+                return buses
+            progress.show(f"{listed} of {expected} connectors")
+            await asyncio.sleep(GLANCE)
+
+
+async def _first_limits(client: Client, bus: DemoBus, buses: list[ListedBus]) -> None:
+    """Raise the limits from the fail-safe values that a new charger begins with."""
+    for listed in buses:
+        for charger in listed.chargers:
+            entity = charger.find("charging_current")
+            if entity is None or charger.name not in bus.currents:
+                continue
+            values = {"entity_id": entity, "value": bus.currents[charger.name]}
+            await client.post("services/number/set_value", values)
+
+
+async def _show_dashboard(
+    client: Client, settings: Settings, buses: list[ListedBus]
+) -> None:
+    """Make the dashboard, or renew it where nobody has changed it."""
+    ours = settings.folder / "dashboard.json"
+    wanted = dashboard(buses)
+    present = await client.command("lovelace/dashboards/list")
+    if not any(one["url_path"] == URL_PATH for one in present):
+        await client.command(
+            "lovelace/dashboards/create",
+            url_path=URL_PATH,
+            title=TITLE,
+            icon=ICON,
+            show_in_sidebar=True,
+        )
+        await _open_first(client)
+    elif not await _is_ours(client, ours.read_text("utf-8") if ours.exists() else ""):
+        return
+    await client.command("lovelace/config/save", url_path=URL_PATH, config=wanted)
+    ours.write_text(json.dumps(wanted), encoding="utf-8")
+
+
+async def _is_ours(client: Client, written: str) -> bool:
+    try:
+        stored = await client.command("lovelace/config", url_path=URL_PATH)
+    except DemoError:
+        # An earlier start was interrupted before it saved any.
+        return True
+    return written != "" and stored == json.loads(written)
+
+
+async def _open_first(client: Client) -> None:
+    stored = await client.command("frontend/get_system_data", key="core")
+    core: Mapping[str, Any] = stored["value"] or {}
+    await client.command(
+        "frontend/set_system_data",
+        key="core",
+        value={**core, "default_panel": URL_PATH},
+    )

@@ -1,0 +1,82 @@
+"""Chargers and their entities, found in Home Assistant's registries. Pure."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+import re
+from typing import Any, Final
+
+DOMAIN: Final = "evse_bus"
+
+_CONNECTOR: Final = re.compile(r"(\d+)_(.+)")
+
+
+@dataclass(slots=True)
+class Part:
+    """A bus, a charger or a connector: its name, and its entities by their keys."""
+
+    name: str
+    entities: dict[str, str] = field(default_factory=dict)
+
+    def find(self, *keys: str) -> str | None:
+        """Return the first of these entities that is there."""
+        return next((self.entities[key] for key in keys if key in self.entities), None)
+
+
+@dataclass(slots=True)
+class ListedCharger(Part):
+    """A charger; what it says of its connectors stands there."""
+
+    connectors: dict[int, Part] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class ListedBus(Part):
+    """A bus and its chargers, in the order of their names."""
+
+    chargers: list[ListedCharger] = field(default_factory=list)
+
+
+def list_buses(
+    entities: Iterable[Mapping[str, Any]], devices: Iterable[Mapping[str, Any]]
+) -> list[ListedBus]:
+    """Return what is there, of the registries as the websocket API lists them.
+
+    Disabled entities are left out: a dashboard could show nothing of them.
+    """
+    names = {
+        device["id"]: device["name_by_user"] or device["name"] for device in devices
+    }
+    owners = {
+        identifier: names[device["id"]]
+        for device in devices
+        for domain, identifier in device["identifiers"]
+        if domain == DOMAIN
+    }
+    buses: dict[str, ListedBus] = {}
+    chargers: dict[str, ListedCharger] = {}
+    for entity in entities:
+        if entity["platform"] != DOMAIN or entity["disabled_by"] is not None:
+            continue
+        entry, subentry = entity["config_entry_id"], entity["config_subentry_id"]
+        bus = buses.setdefault(entry, ListedBus(owners.get(entry, entry)))
+        key = entity["unique_id"].removeprefix(f"{subentry or entry}_")
+        if subentry is None:
+            bus.entities[key] = entity["entity_id"]
+            continue
+        if subentry not in chargers:
+            name = owners.get(subentry, subentry)
+            chargers[subentry] = ListedCharger(name)
+            bus.chargers.append(chargers[subentry])
+        charger = chargers[subentry]
+        if (match := _CONNECTOR.fullmatch(key)) is None:
+            charger.entities[key] = entity["entity_id"]
+            continue
+        number = int(match[1])
+        name = names.get(entity["device_id"], charger.name)
+        connector = charger.connectors.setdefault(number, Part(name))
+        connector.entities[match[2]] = entity["entity_id"]
+    for bus in buses.values():
+        bus.chargers.sort(key=lambda charger: charger.name)
+    for charger in chargers.values():
+        charger.connectors = dict(sorted(charger.connectors.items()))
+    return sorted(buses.values(), key=lambda bus: bus.name)

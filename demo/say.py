@@ -1,0 +1,61 @@
+"""What the demo tells a person while it works."""
+
+from collections.abc import Callable
+import sys
+import time
+from typing import Final, Self
+
+WIDTH: Final = 78
+EVERY: Final = 5.0
+"""Seconds between two lines of progress where lines cannot be overwritten."""
+
+
+def say(text: str = "") -> None:
+    """Print a line."""
+    sys.stdout.write(f"demo: {text}\n" if text else "\n")
+    sys.stdout.flush()
+
+
+class Progress:
+    """One thing that takes a while; `with` ends its line."""
+
+    def __init__(self, title: str, clock: Callable[[], float] = time.monotonic) -> None:
+        """Begin now."""
+        self._title = title
+        self._clock = clock
+        self._begin = clock()
+        self._told = self._begin
+        self._live = sys.stdout.isatty()
+
+    def __enter__(self) -> Self:
+        """Say what begins."""
+        if self._live:
+            self.show()
+        else:
+            say(f"{self._title} ...")
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        """Say how long it took, if it came to its end."""
+        if self._live:
+            sys.stdout.write("\r" + " " * WIDTH + "\r")
+        if kind is None:
+            say(f"{self._title}: done ({self.seconds:.0f} s)")
+
+    @property
+    def seconds(self) -> float:
+        """Return how long it has taken so far."""
+        return self._clock() - self._begin
+
+    def show(self, detail: str = "") -> None:
+        """Say how far it is."""
+        now = self._clock()
+        text = f"{self._title} ... {self.seconds:.0f} s"
+        if detail:
+            text += f", {detail}"
+        if self._live:
+            sys.stdout.write("\r" + f"demo: {text}"[:WIDTH].ljust(WIDTH))
+            sys.stdout.flush()
+        elif now - self._told >= EVERY:
+            self._told = now
+            say(text)
