@@ -41,7 +41,7 @@ class MeterTotal:
         if self.total is None:
             return True
         if self.generation is not None:
-            return generation == self.generation
+            return generation == self.generation and now >= self.total
         # After a restart nobody knows; what cannot have flowed was not this meter.
         return 0 <= now - self.total <= HIGHEST_POWER * away / 3600 + 1
 
