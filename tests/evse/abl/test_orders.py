@@ -1,0 +1,438 @@
+"""Orders and a box: what reaches the wire, and what must not."""
+
+import asyncio
+from contextlib import suppress
+
+from hypothesis import HealthCheck, given, settings, strategies as st
+import pytest
+
+from custom_components.evse_bus.evse.model import (
+    EvseError,
+    ExchangeRefusedError,
+    Fault,
+    LineLostError,
+    NotAvailableError,
+    NotConfirmedError,
+    OrderChange,
+    Orders,
+    RefusedOrderError,
+    ReplyTimeoutError,
+    Status,
+)
+from tests.virtual import AblBox, Car
+
+from .scene import LIMIT, Scene, config, orders, until
+
+PAUSE = 1000
+ON = OrderChange(allowed=True)
+OFF = OrderChange(allowed=False)
+
+
+def limit(current: float) -> OrderChange:
+    return OrderChange(current=current)
+
+
+def plugged() -> Car:
+    car = Car(ramp=0.1, reaction=0.0)
+    car.plug_in()
+    return car
+
+
+async def test_a_limit_goes_down_and_up() -> None:
+    async with Scene(AblBox(1, car=plugged())) as scene:
+        charger = await scene.settled(config(), orders())
+        await charger.change_orders(limit(10))
+        assert scene.boxes[0].ic_amps == pytest.approx(9.96)
+        assert charger.reading is not None
+        assert charger.reading.offered_current == 9.96
+        await charger.change_orders(limit(16))
+        assert scene.writes(LIMIT) == [166, 266]
+        assert charger.orders.limit.current == 16
+
+
+async def test_a_limit_that_stands_is_not_written_again() -> None:
+    async with Scene(AblBox(1)) as scene:
+        charger = await scene.settled(config(), orders())
+        await charger.change_orders(limit(10))
+        await charger.change_orders(limit(10))
+        assert scene.writes() == [166]
+
+
+async def test_a_pause_is_the_real_one_and_ends_by_the_switch() -> None:
+    box = AblBox(1, car=plugged())
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders(allowed=True))
+        await until(lambda: box.state == "C2")
+        await charger.change_orders(OFF)
+        await until(lambda: box.state == "B2")
+        await scene.polled(charger)
+        assert charger.reading is not None
+        assert charger.reading.allowed is False
+        assert charger.reading.offered_current == 0
+        # The cable is still seen.
+        connector = charger.reading.connectors[1]
+        assert (connector.plugged, connector.status) == (True, Status.SUSPENDED_EVSE)
+        await charger.change_orders(ON)
+        assert scene.writes() == [PAUSE, 266]
+        await until(lambda: box.state == "C2")
+
+
+async def test_a_slider_moved_while_paused_is_stored_and_writes_nothing() -> None:
+    async with Scene(AblBox(1, car=plugged())) as scene:
+        charger = await scene.settled(config(), orders(allowed=False))
+        await until(lambda: scene.writes() == [PAUSE])
+        await charger.change_orders(limit(8))
+        await charger.change_orders(limit(13))
+        await scene.polled(charger)
+        assert scene.writes() == [PAUSE]
+        assert charger.orders.limit.current == 13
+        assert charger.orders.allowed is False
+        await charger.change_orders(ON)
+        assert scene.writes() == [PAUSE, 216]
+
+
+@pytest.mark.parametrize("allowed", [None, True])
+async def test_a_slider_does_not_start_what_somebody_else_has_paused(
+    allowed: bool | None,  # noqa: FBT001
+) -> None:
+    box = AblBox(1, car=plugged())
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders(allowed=allowed))
+        box.set_by_somebody(0)
+        await scene.polled(charger)
+        assert charger.reading is not None
+        assert charger.reading.allowed is False
+        await charger.change_orders(limit(8))
+        await charger.change_orders(limit(10))
+        await scene.polled(charger)
+        assert scene.writes() == []
+        assert charger.orders.limit.current == 10
+        await charger.change_orders(ON)
+        assert scene.writes() == [166]
+
+
+async def test_a_limit_in_e0_is_lowered_only() -> None:
+    box = AblBox(1, car=plugged())
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders(10))
+        box.stop_locally()
+        await scene.polled(charger)
+        await charger.change_orders(limit(16))
+        assert scene.writes() == [166]
+        assert charger.orders.limit.current == 16
+        await charger.change_orders(limit(8))
+        assert scene.writes() == [166, 133]
+        with pytest.raises(NotAvailableError, match="enable it first"):
+            await charger.change_orders(ON)
+        assert charger.orders.allowed is None
+        assert box.state == "E0"
+        assert scene.writes() == [166, 133]
+
+
+async def test_nothing_is_written_while_a_box_is_being_set_up() -> None:
+    box = AblBox(1)
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders())
+        box.outlet.go("E2")
+        await scene.polled(charger)
+        with pytest.raises(NotAvailableError, match="set up"):
+            await charger.change_orders(limit(10))
+        await scene.polled(charger)
+        assert scene.writes() == []
+        # The lowering stands, and is sent as soon as it can be.
+        box.outlet.go("A1")
+        await until(lambda: scene.writes() == [166])
+
+
+async def test_after_a_power_cycle_the_limit_is_asserted_at_once() -> None:
+    box = AblBox(1, boot_time=0.1)
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(poll_interval=0.2), orders(10))
+        assert charger.statistics.reasserted == 0
+        box.power_cycle()
+        assert box.ic_amps > 15
+        await until(lambda: scene.writes() == [166, 166])
+        await scene.polled(charger)
+        assert charger.statistics.reasserted == 1
+        assert Fault.LIMIT_NOT_TAKEN not in charger.faults
+        # Between reading it above and writing there is no other exchange.
+        registers = [one.register for one in scene.requests() if one.device_id == 1]
+        second = len(registers) - 1 - registers[::-1].index(LIMIT)
+        assert registers[second - 1 : second + 2] == [0x2E, LIMIT, 0x2E]
+
+
+async def test_after_a_power_cycle_a_pause_is_asserted_too() -> None:
+    box = AblBox(1, car=plugged(), boot_time=0.1)
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders(allowed=False))
+        box.power_cycle()
+        await until(lambda: scene.writes() == [PAUSE, PAUSE])
+        await scene.polled(charger)
+        assert charger.statistics.reasserted == 1
+        assert box.ic_amps == 0
+
+
+async def test_permission_is_never_given_again_by_itself() -> None:
+    box = AblBox(1, car=plugged())
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders(allowed=True))
+        box.set_by_somebody(0)
+        await scene.polled(charger, 5)
+        box.set_by_somebody(8)
+        await scene.polled(charger, 5)
+        # Neither the pause nor the lower limit of somebody else is undone.
+        assert scene.writes() == []
+        assert charger.orders.allowed is True
+
+
+async def test_a_lower_ic_is_shown_and_left_alone() -> None:
+    async with Scene(AblBox(1, cable_current=13, car=plugged())) as scene:
+        charger = await scene.settled(config(), orders(16))
+        assert charger.reading is not None
+        assert charger.reading.offered_current == pytest.approx(12.96)
+        await charger.change_orders(limit(14))
+        assert charger.orders.limit.current == 14
+        assert Fault.LIMIT_NOT_TAKEN not in charger.faults
+
+
+async def test_a_box_that_does_not_follow() -> None:
+    box = AblBox(1)
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders())
+        box.outlet.ignore_limit = True
+        with pytest.raises(NotConfirmedError):
+            await charger.change_orders(limit(10))
+        assert Fault.LIMIT_NOT_TAKEN in charger.faults
+        assert charger.statistics.reasserted >= 1
+        # The lowering stands all the same.
+        assert charger.orders.limit.current == 10
+        box.outlet.ignore_limit = False
+        await until(lambda: box.ic_amps < 10)
+        await until(lambda: Fault.LIMIT_NOT_TAKEN not in charger.faults)
+        assert charger.available
+
+
+async def test_a_box_that_does_not_follow_the_permission() -> None:
+    box = AblBox(1)
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders(allowed=False))
+        box.outlet.ignore_limit = True
+        with pytest.raises(NotConfirmedError):
+            await charger.change_orders(ON)
+        # A raise that was not confirmed does not stand.
+        assert charger.orders.allowed is False
+
+
+async def test_a_box_that_refuses() -> None:
+    box = AblBox(1)
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders())
+        charger.slot.ready = float("inf")
+        await asyncio.sleep(0.1)
+        box.faults.once("replace", b">0190046B\r\n")
+        with pytest.raises(ExchangeRefusedError, match="exception 4") as caught:
+            await charger.change_orders(OFF)
+        assert caught.value.code == 4
+        assert charger.statistics.refused == 1
+        assert Fault.LIMIT_NOT_TAKEN in charger.faults
+        # The order to pause stands, and is carried out.
+        charger.slot.ready = 0
+        scene.bus.add(charger)
+        await until(lambda: Fault.LIMIT_NOT_TAKEN not in charger.faults)
+        assert box.ic_amps == 0
+
+
+async def test_a_lost_answer_is_settled_by_reading() -> None:
+    box = AblBox(1)
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders())
+        charger.slot.ready = float("inf")
+        await asyncio.sleep(0.1)
+        box.faults.once("lose")
+        box.faults.once("late", 0.2)
+        await charger.change_orders(OFF)
+        assert box.ic_amps == 0
+        assert set(scene.writes()) == {PAUSE}
+        assert charger.orders.allowed is False
+
+
+async def test_a_dead_box_makes_a_command_fail() -> None:
+    box = AblBox(1)
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders())
+        box.faults.dead = True
+        with pytest.raises(ReplyTimeoutError):
+            await charger.change_orders(limit(8))
+        assert charger.orders.limit.current == 8
+        box.faults.clear()
+        await until(lambda: box.ic_amps < 8)
+
+
+async def test_a_pause_is_never_merged_away() -> None:
+    box = AblBox(1, car=plugged())
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders(allowed=True))
+        results = await asyncio.gather(
+            *(
+                charger.change_orders(change)
+                for change in (limit(8), limit(9), ON, limit(10), OFF, limit(11))
+            ),
+            return_exceptions=True,
+        )
+        assert not isinstance(results[4], BaseException)
+        assert scene.writes()[0] == PAUSE
+        assert set(scene.writes()) == {PAUSE}
+        assert charger.orders == Orders(
+            limit=limit(11).apply(orders()).limit, allowed=False
+        )
+
+
+async def test_off_while_on_is_under_way() -> None:
+    box = AblBox(1, car=plugged())
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders(allowed=False))
+        box.outlet.ignore_limit = True
+        on = asyncio.create_task(charger.change_orders(ON))
+        await until(lambda: 266 in scene.writes())
+        box.outlet.ignore_limit = False
+        await charger.change_orders(OFF)
+        with suppress(EvseError):
+            await on
+        await scene.polled(charger)
+        assert box.ic_amps == 0
+        assert charger.orders.allowed is False
+
+
+async def test_a_limit_of_nothing_pauses_and_a_limit_ends_it() -> None:
+    box = AblBox(1, car=plugged())
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders(allowed=True))
+        await charger.change_orders(limit(0))
+        assert box.ic_amps == 0
+        await charger.change_orders(limit(10))
+        assert scene.writes() == [PAUSE, 166]
+        # Not what the switch has paused, though.
+        await charger.change_orders(OFF)
+        await charger.change_orders(limit(0))
+        await charger.change_orders(limit(10))
+        assert scene.writes() == [PAUSE, 166, PAUSE]
+
+
+async def test_absurd_wishes() -> None:
+    async with Scene(AblBox(1)) as scene:
+        charger = await scene.settled(config(), orders(10))
+        for current in (float("nan"), float("inf"), -1, 10000, 5.9, 17):
+            with pytest.raises(RefusedOrderError):
+                await charger.change_orders(limit(current))
+        assert scene.writes() == [166]
+        assert charger.orders.limit.current == 10
+
+
+async def test_a_lost_port_and_back() -> None:
+    box = AblBox(1)
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders(10))
+        scene.virtual.unplug()
+        await until(lambda: not charger.available)
+        box.power_cycle()
+        with pytest.raises(LineLostError):
+            await charger.change_orders(limit(8))
+        scene.virtual.replug()
+        await until(lambda: box.ic_amps < 8)
+        assert scene.writes() == [166, 133]
+
+
+# -- The lifetime of orders ------------------------------------------------------------
+
+
+async def test_orders_that_nobody_renews_become_the_fail_safe() -> None:
+    box = AblBox(1, car=plugged())
+    async with Scene(box) as scene:
+        charger = await scene.settled(
+            config(order_lifetime=1.0), orders(16, allowed=True, fail_safe=8)
+        )
+        await until(lambda: charger.orders_expired)
+        await until(lambda: scene.writes() == [133])
+        await scene.polled(charger)
+        assert charger.statistics.reasserted == 0
+        assert charger.orders.limit.current == 16
+        await charger.change_orders(limit(12))
+        assert scene.writes() == [133, 200]
+        assert not charger.orders_expired
+
+
+async def test_a_higher_fail_safe_is_written_once() -> None:
+    box = AblBox(1)
+    async with Scene(box) as scene:
+        charger = await scene.settled(
+            config(order_lifetime=1.0), orders(6, fail_safe=10)
+        )
+        await until(lambda: scene.writes() == [100, 166])
+        box.set_by_somebody(7)
+        await scene.polled(charger, 4)
+        assert scene.writes() == [100, 166]
+
+
+async def test_no_passing_of_time_starts_a_stopped_car() -> None:
+    box = AblBox(1, car=plugged())
+    async with Scene(box) as scene:
+        charger = await scene.settled(
+            config(order_lifetime=0.8), orders(6, allowed=False, fail_safe=10)
+        )
+        await until(lambda: charger.orders_expired)
+        await scene.polled(charger, 4)
+        assert scene.writes() == [PAUSE]
+
+
+async def test_a_fail_safe_of_nothing_ends_with_the_next_limit() -> None:
+    box = AblBox(1, car=plugged())
+    async with Scene(box) as scene:
+        charger = await scene.settled(
+            config(order_lifetime=0.8), orders(10, allowed=True, fail_safe=0)
+        )
+        await until(lambda: box.ic_amps == 0)
+        await scene.polled(charger)
+        await charger.change_orders(limit(10))
+        assert scene.writes() == [166, PAUSE, 166]
+
+
+# -- Any sequence ----------------------------------------------------------------------
+
+_changes = st.lists(
+    st.one_of(
+        st.sampled_from([0.0, 6.0, 7.3, 10.0, 15.9, 16.0]).map(limit),
+        st.just(OFF),
+        st.just(ON),
+    ),
+    min_size=1,
+    max_size=6,
+)
+
+
+@settings(
+    max_examples=8, suppress_health_check=[HealthCheck.too_slow], derandomize=True
+)
+@given(_changes)
+def test_no_sequence_of_changes_starts_what_the_switch_has_stopped(
+    changes: list[OrderChange],
+) -> None:
+    async def scene_of() -> None:
+        box = AblBox(1, car=plugged(), turn_round=0.0005)
+        async with Scene(box) as scene:
+            charger = scene.add(config(installation_limit=12), orders(6))
+            await until(lambda: charger.available and scene.writes())
+            allowed: bool | None = None
+            for change in changes:
+                before = len(scene.writes())
+                with suppress(RefusedOrderError):
+                    await charger.change_orders(change)
+                if change.allowed is not None:
+                    allowed = change.allowed
+                new = scene.writes()[before:]
+                assert all(duty == PAUSE or duty <= 200 for duty in new)
+                if allowed is False:
+                    assert set(new) <= {PAUSE}
+                    assert box.ic_amps == 0
+                assert charger.orders.allowed is allowed
+
+    asyncio.run(scene_of())
