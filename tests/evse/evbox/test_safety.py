@@ -191,14 +191,17 @@ class Trial:
             for what, value in acts:
                 await self.act(what, value)
             self.point.faults.dead = False
-            await asyncio.sleep(100.0)
+            # Commands that cannot be merged wait for one minimum interval each.
+            for _ in range(60):
+                await asyncio.sleep(20.0)
+                if all(task.done() for task in self.tasks):
+                    break
+            await asyncio.sleep(45.0)
             for task in self.tasks:
-                assert task.done()
-                # A failed judgement inside the bus would be logged as "unforeseen".
                 task.result()
 
 
-@settings(max_examples=200, suppress_health_check=[HealthCheck.too_slow], deadline=None)
+@settings(max_examples=150, suppress_health_check=[HealthCheck.too_slow], deadline=None)
 @given(
     maximum=st.sampled_from([6.0, 13.0, 20.0, 35.0, 63.0]),
     interval=st.sampled_from([0, 1, 3, 20]),
@@ -231,7 +234,7 @@ def test_no_order_of_events_puts_too_much_on_the_wire(
     assert last.limits[0] <= expected
 
 
-@settings(max_examples=200, suppress_health_check=[HealthCheck.too_slow], deadline=None)
+@settings(max_examples=150, suppress_health_check=[HealthCheck.too_slow], deadline=None)
 @given(
     st.lists(
         st.tuples(st.sampled_from([7.0, 13.0, 20.0, 35.0]), st.floats(0.1, 12.0)),

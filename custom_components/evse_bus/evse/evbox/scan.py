@@ -135,7 +135,7 @@ def _report(config: EvboxConfig, heard: _Heard) -> ScanReport:
     if heard.bad_frames and config.addressed == ANY_SERIAL:
         duplicates.add(ANY_SERIAL)
     return ScanReport(
-        found=tuple(one for address, one in found.items() if address not in duplicates),
+        found=tuple(found[address] for address in sorted(found.keys() - duplicates)),
         duplicates=tuple(sorted(duplicates)),
         unreadable=heard.unreadable,
     )

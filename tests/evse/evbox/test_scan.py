@@ -1,0 +1,249 @@
+"""Finding ChargePoints: a probe imposes exactly what was confirmed, up to 6 A."""
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+
+from custom_components.evse_bus.evse.evbox import PROTOCOL, EvboxConfig
+from custom_components.evse_bus.evse.model import (
+    CurrentLimit,
+    LineBusyError,
+    Orders,
+    RefusedOrderError,
+    ScanReport,
+)
+from tests.evse.simulated import now, simulate
+from tests.virtual import EvboxChargePoint, Module
+from tests.virtual.evbox_frames import frame
+
+from .ether import ORDERS, Scene
+
+ANYBODY = EvboxConfig(key="scan", name="scan", address=0, installation_limit=32.0)
+CONFIRMED = Orders(
+    limit=CurrentLimit(current=32.0, phases=(None, 0.0, None)),
+    fail_safe=CurrentLimit(current=4.0, phases=(None, None, 3.5)),
+    fail_safe_timeout=120,
+)
+
+
+async def find(
+    stage: Scene, config: EvboxConfig = ANYBODY, orders: Orders = CONFIRMED
+) -> tuple[ScanReport, list[float]]:
+    progress: list[float] = []
+    report = await PROTOCOL.scan(stage.bus, config, orders, progress.append)
+    assert progress == sorted(progress)
+    assert progress[-1] == 1.0
+    assert all(0 <= share <= 1 for share in progress)
+    return report, progress
+
+
+def test_the_one_box_on_the_line() -> None:
+    async def scene() -> None:
+        point = EvboxChargePoint(1923054, 3, max_current=25.0)
+        async with Scene.of(point) as stage:
+            started = now()
+            report, _ = await find(stage)
+            (one,) = report.found
+            assert (one.address, one.serial) == (1923054, "1923054")
+            assert one.info.serial == "1923054"
+            assert (one.maximum_current, one.connectors) == (25.0, 3)
+            assert (report.duplicates, report.unreadable) == ((), False)
+            assert now() - started < 1.5
+            (order,) = stage.ether.orders
+            assert order.serial == "00000000"
+            assert order.limits == (6.0, 0.0, 6.0)
+            assert order.fallback == (4.0, 4.0, 3.5)
+            assert order.timeout == 120
+
+    simulate(scene())
+
+
+def test_a_pause_is_imposed_as_a_pause() -> None:
+    async def scene() -> None:
+        async with Scene.of(EvboxChargePoint(5)) as stage:
+            await find(stage, orders=replace(CONFIRMED, allowed=False))
+            assert stage.ether.orders[0].limits == (0.0, 0.0, 0.0)
+
+    simulate(scene())
+
+
+def test_a_typed_serial_number_reaches_that_box_only() -> None:
+    async def scene() -> None:
+        points = [EvboxChargePoint(11), EvboxChargePoint(12)]
+        async with Scene.of(*points) as stage:
+            report, _ = await find(stage, replace(ANYBODY, address=12))
+            assert [one.address for one in report.found] == [12]
+            assert [len(point.orders) for point in points] == [0, 1]
+
+    simulate(scene())
+
+
+def test_several_boxes_that_answer_one_after_the_other_are_all_found() -> None:
+    async def scene() -> None:
+        points = [
+            EvboxChargePoint(serial, turn_round=0.11 * number)
+            for number, serial in enumerate((11, 12, 13))
+        ]
+        async with Scene.of(*points) as stage:
+            report, _ = await find(stage)
+            assert [one.address for one in report.found] == [11, 12, 13]
+            assert report.duplicates == ()
+
+    simulate(scene())
+
+
+def test_two_boxes_that_answer_69_are_duplicates() -> None:
+    async def scene() -> None:
+        points = [
+            EvboxChargePoint(serial, serial, turn_round=0.11 * serial)
+            for serial in (1, 2)
+        ]
+        async with Scene.of(*points) as stage:
+            report, _ = await find(stage, replace(ANYBODY, command=69))
+            assert (report.found, report.duplicates) == ((), (0,))
+
+    simulate(scene())
+
+
+def test_one_box_that_knows_69_only() -> None:
+    async def scene() -> None:
+        async with Scene.of(EvboxChargePoint(7, commands={69})) as stage:
+            report, _ = await find(stage)
+            assert report == ScanReport()
+            report, _ = await find(stage, replace(ANYBODY, command=69))
+            (one,) = report.found
+            assert (one.address, one.serial) == (0, None)
+
+    simulate(scene())
+
+
+@pytest.mark.parametrize(
+    ("damage", "duplicates"),
+    [(lambda _data: b"\x02A0\x7f\x80\x03", (0,)), (lambda _data: b"\x80\xfe\x11", ())],
+)
+def test_answers_that_nobody_can_read(
+    damage: Callable[[bytes], bytes], duplicates: tuple[int, ...]
+) -> None:
+    async def scene() -> None:
+        async with Scene.of(EvboxChargePoint(11, min_interval=20)) as stage:
+            stage.ether.damage = damage
+            report, _ = await find(stage)
+            assert (report.found, report.duplicates) == ((), duplicates)
+            assert report.unreadable
+            # The box has heard the first probe: the second is not too soon.
+            assert len(stage.ether.sent) == 2
+            assert stage.ether.pauses()[0] >= 20.0
+            assert stage.ether.points[0].counters.too_soon == 0
+            # A typed number is that of one box, so it is the line that is bad.
+            report, _ = await find(stage, replace(ANYBODY, address=11))
+            assert (report.duplicates, report.unreadable) == ((), True)
+
+    simulate(scene())
+
+
+def test_a_lost_answer_is_asked_for_once_more() -> None:
+    async def scene() -> None:
+        point = EvboxChargePoint(11, min_interval=20)
+        async with Scene.of(point) as stage:
+            point.faults.once("lose")
+            report, progress = await find(stage)
+            assert [one.address for one in report.found] == [11]
+            assert len(progress) > 20
+
+    simulate(scene())
+
+
+def test_nobody_there() -> None:
+    async def scene() -> None:
+        async with Scene.of() as stage:
+            started = now()
+            report, _ = await find(stage)
+            assert report == ScanReport()
+            assert now() - started < 24.0
+
+    simulate(scene())
+
+
+def test_an_answer_that_cannot_be_is_not_a_box() -> None:
+    async def scene() -> None:
+        point = EvboxChargePoint(11, [Module(voltages=(4000.0, 0.0, 0.0))])
+        async with Scene.of(point) as stage:
+            report, _ = await find(stage)
+            assert report.found == ()
+            assert report.unreadable
+
+    simulate(scene())
+
+
+def test_the_same_answer_twice_is_one_box() -> None:
+    async def scene() -> None:
+        point = EvboxChargePoint(11)
+        async with Scene.of(point) as stage:
+            point.faults.once("duplicate")
+            report, _ = await find(stage)
+            assert [one.address for one in report.found] == [11]
+            assert report.duplicates == ()
+
+    simulate(scene())
+
+
+def test_other_peoples_answers_are_not_found() -> None:
+    async def scene() -> None:
+        async with Scene.of(EvboxChargePoint(11)) as stage:
+            others = frame("A080690001015E00") + frame("A08068000000770001015E00")
+            stage.ether.damage = lambda data: others + data
+            report, _ = await find(stage, replace(ANYBODY, address=11))
+            assert [one.address for one in report.found] == [11]
+
+    simulate(scene())
+
+
+def test_a_search_does_not_set_the_limits_of_boxes_in_use() -> None:
+    async def scene() -> None:
+        points = [EvboxChargePoint(11), EvboxChargePoint(12)]
+        async with Scene.of(*points) as stage:
+            stage.add(11)
+            with pytest.raises(RefusedOrderError, match="serial number"):
+                await find(stage)
+            with pytest.raises(RefusedOrderError):
+                await find(stage, replace(ANYBODY, address=12, command=69))
+            report, _ = await find(stage, replace(ANYBODY, address=12))
+            assert [one.address for one in report.found] == [12]
+        assert {order.serial for order in stage.ether.orders} == {
+            "00000011",
+            "00000012",
+        }
+
+    simulate(scene())
+
+
+def test_orders_that_cannot_be_sent_are_refused() -> None:
+    async def scene() -> None:
+        async with Scene.of(EvboxChargePoint(11)) as stage:
+            orders = replace(ORDERS, limit=CurrentLimit(current=float("nan")))
+            with pytest.raises(RefusedOrderError):
+                await find(stage, orders=orders)
+            assert stage.ether.sent == []
+
+    simulate(scene())
+
+
+def test_others_who_never_stop_talking_are_told_as_such() -> None:
+    async def scene() -> None:
+        async with Scene.of(EvboxChargePoint(11)) as stage:
+
+            async def talk() -> None:
+                while True:
+                    stage.ether.foreign(b"\x55")
+                    await asyncio.sleep(0.05)
+
+            talking = asyncio.create_task(talk())
+            await asyncio.sleep(0.1)
+            with pytest.raises(LineBusyError):
+                await find(stage)
+            talking.cancel()
+            assert stage.ether.sent == []
+
+    simulate(scene())
