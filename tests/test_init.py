@@ -19,6 +19,7 @@ from homeassistant.helpers import (
 )
 import pytest
 
+from custom_components.evse_bus import async_remove_config_entry_device
 from custom_components.evse_bus.const import DOMAIN, SUBENTRY_CHARGER
 from tests.common import (
     bus_entry,
@@ -287,6 +288,17 @@ async def test_a_changed_set_up_is_followed_in_place(hass: HomeAssistant) -> Non
         assert device.name == "Garage"
 
 
+async def test_a_new_name_of_the_bus(hass: HomeAssistant) -> None:
+    async with running(hass, AblBox(1)) as (entry, bus):
+        hass.config_entries.async_update_entry(entry, title="Car park")
+        await hass.async_block_till_done()
+        device = dr.async_get(hass).async_get_device_by_identifier(
+            (DOMAIN, "bus"), "bus"
+        )
+        assert device.name == "Car park"
+        assert bus.opened == 1
+
+
 async def test_a_new_address_makes_the_charger_anew(hass: HomeAssistant) -> None:
     box = AblBox(2, serial="2W22xy00000002")
     with VirtualBus.pty(box) as bus:
@@ -357,18 +369,19 @@ async def test_a_module_that_is_gone_can_be_deleted(
     async with running(hass, two_modules, poll_interval=1.0) as (entry, _):
         power = await get_entity(hass, "sensor", entry, "2_power")
         devices = dr.async_get(hass)
-        remove = entry.runtime_data.forget_connector
-        bus = devices.async_get_device_by_identifier((DOMAIN, "bus"), "bus")
-        assert not remove({key for _, key in bus.identifiers})
-        assert not remove({"evbox1923054"})
-        assert not remove({"evbox1923054_2"})
-
-        two_modules.remove_module()
-        await wait_for_state(hass, power, "unavailable")
         module = devices.async_get_child_device_by_identifier(
             (DOMAIN, "evbox1923054_2"), "bus"
         )
-        assert remove({key for _, key in module.identifiers})
+        for device in (
+            devices.async_get_device_by_identifier((DOMAIN, "bus"), "bus"),
+            devices.async_get_device_by_identifier((DOMAIN, "evbox1923054"), "bus"),
+            module,
+        ):
+            assert not await async_remove_config_entry_device(hass, entry, device)
+
+        two_modules.remove_module()
+        await wait_for_state(hass, power, "unavailable")
+        assert await async_remove_config_entry_device(hass, entry, module)
         devices.async_remove_device(module.id)
         await hass.async_block_till_done()
         assert hass.states.get(power) is None

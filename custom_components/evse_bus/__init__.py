@@ -38,10 +38,10 @@ async def async_setup(
 
 async def async_setup_entry(hass: HomeAssistant, entry: EvseBusConfigEntry) -> bool:
     """Set up a bus and the chargers on it."""
-    coordinator = BusCoordinator(hass, entry)
+    # There from the beginning, so that diagnostics can tell of a bus that fails.
+    entry.runtime_data = coordinator = BusCoordinator(hass, entry)
     try:
         await coordinator.async_start()
-        entry.runtime_data = coordinator
         await hass.config_entries.async_forward_entry_setups(entry, PLATFORMS)
     except LineError as error:
         await coordinator.async_stop()

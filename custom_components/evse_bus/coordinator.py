@@ -109,13 +109,13 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         self._stop_statistics: CALLBACK_TYPE | None = None
         self._unsubscribe_bus: CALLBACK_TYPE = lambda: None
         self._changing = asyncio.Lock()
+        self._stopped = False
 
     # -- Life --------------------------------------------------------------------
 
     async def async_start(self) -> None:
         """Load the orders, then open the port; raises LineError."""
         await self.orders.async_load()
-        self.devices.create_bus()
         await self.async_match_subentries()
         self._unsubscribe_bus = self.bus.subscribe(partial(self._notify, BUS))
         await self.bus.start()
@@ -123,6 +123,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
     async def async_stop(self, _event: Event | None = None) -> None:
         """Close the port and leave nothing behind."""
         async with self._changing:
+            self._stopped = True
             self._unsubscribe_bus()
             self._unsubscribe_bus = lambda: None
             await self.bus.stop()
@@ -140,6 +141,10 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         Only what differs is touched: the others keep talking.
         """
         async with self._changing:
+            if self._stopped:
+                return
+            self.bus.name = self.entry.title
+            self.devices.show_bus()
             wanted = {
                 subentry.subentry_id: subentry
                 for subentry in self.entry.get_subentries_of_type(SUBENTRY_CHARGER)

@@ -27,8 +27,8 @@ class BusDevices:
         self._registry = dr.async_get(hass)
         self._bus_id = ""
 
-    def create_bus(self) -> None:
-        """Register the bus: chargers can hang on it only when it is there."""
+    def show_bus(self) -> None:
+        """Register the bus; chargers can hang on it only when it is there."""
         device = self._registry.async_get_or_create(
             config_entry_id=self._entry.entry_id,
             identifiers={(DOMAIN, self._entry.entry_id)},

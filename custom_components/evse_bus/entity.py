@@ -6,8 +6,9 @@ much, and most of it is what was told before.
 
 from abc import abstractmethod
 from collections.abc import Callable, Hashable, Iterable
-from typing import TYPE_CHECKING, Protocol, override
+from typing import TYPE_CHECKING, Final, Protocol, override
 
+from homeassistant.config_entries import ConfigEntryState
 from homeassistant.core import callback
 from homeassistant.helpers.device_registry import DeviceInfo
 from homeassistant.helpers.update_coordinator import BaseCoordinatorEntity
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
 
     from .evse.charger import Charger
     from .evse.model import Capability, ConnectorReading
+
+
+_GROWING: Final = (ConfigEntryState.SETUP_IN_PROGRESS, ConfigEntryState.LOADED)
 
 
 class CapabilityDescription(Protocol):
@@ -62,6 +66,9 @@ def add_charger_entities(
 
     @callback
     def add(unit: ChargerUnit) -> None:
+        if entry.state not in _GROWING:
+            # The bus still talks while the platforms are being unloaded.
+            return
         new = [
             entity
             for entity in make(coordinator, unit)

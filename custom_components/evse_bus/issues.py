@@ -65,17 +65,19 @@ class BusIssues:
         faults = unit.charger.faults
         config = unit.charger.config
         for fault, key in _FAULT_KEYS.items():
+            if fault not in faults:
+                self._set(key, unit.subentry_id, present=False)
+                continue
             self._set(
                 key,
                 unit.subentry_id,
-                present=fault in faults,
+                present=True,
                 placeholders={
                     "charger": unit.name,
                     "address": str(config.address),
                     "expected": config.serial or "-",
                 },
             )
-
         self._check_timeout(unit)
 
     def _check_timeout(self, unit: ChargerUnit) -> None:
@@ -87,11 +89,14 @@ class BusIssues:
         if not isinstance(told, (int, float)):
             return
         ordered = charger.effective_orders.fail_safe_timeout
+        if ordered >= INTERVALS_PER_TIMEOUT * told:
+            self._set(TIMEOUT_RAISED, unit.subentry_id, present=False)
+            return
         used = charger.setpoint.fail_safe_timeout
         self._set(
             TIMEOUT_RAISED,
             unit.subentry_id,
-            present=used > ordered and ordered < INTERVALS_PER_TIMEOUT * told,
+            present=used > ordered,
             placeholders={
                 "charger": unit.name,
                 "interval": f"{told:g}",

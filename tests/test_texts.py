@@ -1,0 +1,99 @@
+"""Every key that the code names has a text, and every text belongs to a key."""
+
+import json
+from pathlib import Path
+
+from homeassistant.components.sensor import SensorDeviceClass
+import pytest
+
+from custom_components.evse_bus import (
+    binary_sensor,
+    button,
+    number,
+    sensor_tables,
+    switch as switches,
+)
+from custom_components.evse_bus.errors import _COMMAND_KEYS, _PORT_KEYS
+from custom_components.evse_bus.evse.model import Fault, Status
+from custom_components.evse_bus.issues import (
+    _FAULT_KEYS,
+    LOST,
+    NOT_STORED,
+    TIMEOUT_RAISED,
+)
+from tests.flow import english
+
+HERE = Path(__file__).parents[1] / "custom_components/evse_bus"
+
+DESCRIPTIONS = {
+    "binary_sensor": [
+        *binary_sensor.CONNECTOR_SENSORS,
+        binary_sensor.CONNECTED,
+        binary_sensor.ORDERS_EXPIRED,
+        binary_sensor.PROBLEM,
+    ],
+    "button": button.BUTTONS,
+    "number": number.NUMBERS,
+    "sensor": [
+        *sensor_tables.BUS_SENSORS,
+        *sensor_tables.CHARGER_SENSORS,
+        *sensor_tables.CHARGER_STATISTICS,
+        *sensor_tables.CONNECTOR_SENSORS,
+        sensor_tables.ENERGY,
+        sensor_tables.ESTIMATED_ENERGY,
+        sensor_tables.FAULT,
+    ],
+    "switch": [*switches.COMMANDS, switches.ALLOWED],
+}
+
+
+@pytest.mark.parametrize("platform", DESCRIPTIONS)
+def test_entities_have_names(platform: str) -> None:
+    texts = english()["entity"][platform]
+    used = set()
+    for description in DESCRIPTIONS[platform]:
+        if description.translation_key is None:
+            # Its device class names it.
+            assert description.device_class, description.key
+            continue
+        used.add(description.translation_key)
+        placeholders = description.translation_placeholders or {}
+        assert texts[description.translation_key]["name"].format(**placeholders)
+    assert used == texts.keys()
+
+
+def test_states_have_names() -> None:
+    texts = english()["entity"]["sensor"]
+    assert texts["status"]["state"].keys() == {str(status) for status in Status}
+    assert texts["fault"]["state"].keys() == {"none", *(str(fault) for fault in Fault)}
+
+
+@pytest.mark.parametrize("platform", DESCRIPTIONS)
+def test_icons_belong_to_entities(platform: str) -> None:
+    icons = json.loads((HERE / "icons.json").read_text())["entity"].get(platform, {})
+    for description in DESCRIPTIONS[platform]:
+        key = description.translation_key
+        if key is not None and description.device_class in (
+            None,
+            SensorDeviceClass.ENUM,
+        ):
+            assert key in icons, key
+    assert icons.keys() <= english()["entity"][platform].keys()
+
+
+def test_errors_have_texts() -> None:
+    texts = english()["exceptions"]
+    keys = {key for _, key in (*_PORT_KEYS, *_COMMAND_KEYS)}
+    assert keys == texts.keys()
+    placeholders = dict.fromkeys(("charger", "port", "error", "expected", "found"), "x")
+    for text in texts.values():
+        assert text["message"].format(**placeholders)
+
+
+def test_issues_have_texts() -> None:
+    assert english()["issues"].keys() == {
+        *_FAULT_KEYS.values(),
+        LOST,
+        NOT_STORED,
+        TIMEOUT_RAISED,
+    }
