@@ -97,6 +97,7 @@ def test_from_the_first_message_to_the_reading() -> None:
             await asyncio.sleep(30.0)
             assert six(stage.ether)[:3] == [True, True, False]
             assert stage.ether.orders[-1].limits == (16.0, 16.0, 16.0)
+            assert charger.setpoint.currents == (16.0, 16.0, 16.0)
             reading = charger.reading
             one, two = reading.connectors[1], reading.connectors[2]
             assert reading.maximum_current == 35.0
@@ -639,6 +640,22 @@ def test_two_chargepoints_by_serial_number() -> None:
             assert point.orders[-1].limits[0] == charger.config.address
             assert {order.serial for order in point.orders} == {point.serial}
             assert point.counters.too_soon == 0
+
+    simulate(scene())
+
+
+def test_eight_of_twenty_modules_each_miss_no_deadline() -> None:
+    async def scene() -> None:
+        points = [EvboxChargePoint(serial, 20) for serial in range(1, 9)]
+        async with Scene.of(*points) as stage:
+            for point in points:
+                stage.add(int(point.serial))
+            await asyncio.sleep(300.0)
+            statistics = stage.bus.wire.statistics
+            assert (statistics.missed_deadlines, statistics.timeouts) == (0, 0)
+        for point in points:
+            assert (point.counters.fail_backs, point.counters.too_soon) == (0, 0)
+            assert len(point.orders) >= 55
 
     simulate(scene())
 
