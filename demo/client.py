@@ -29,6 +29,8 @@ class Client:
 
     async def __aexit__(self, *_: object) -> None:
         """Close what is open."""
+        if self._socket is not None:
+            await self._socket.close()
         await self._session.close()
 
     async def running(self) -> tuple[bool, int]:

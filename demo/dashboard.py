@@ -11,7 +11,6 @@ ICON: Final = "mdi:ev-station"
 
 FULL: Final = 12
 HALF: Final = 6
-THIRD: Final = 4
 """Columns of a section's twelve."""
 HISTORY_HOURS: Final = 0.25
 
@@ -91,16 +90,25 @@ def _connector_cards(connector: Part) -> list[Card | None]:
             icon="mdi:flash",
             color="amber",
         ),
-        *(
-            _tile(
-                connector.find(f"current_{phase}"),
-                THIRD,
-                name=phase.upper(),
-                color="light-blue",
-            )
-            for phase in ("l1", "l2", "l3")
-        ),
+        _currents(connector),
     ]
+
+
+def _currents(connector: Part) -> Card | None:
+    phases = [
+        {"entity": entity, "name": phase.upper()}
+        for phase in ("l1", "l2", "l3")
+        if (entity := connector.find(f"current_{phase}"))
+    ]
+    if not phases:
+        return None
+    return {
+        "type": "glance",
+        "columns": len(phases),
+        "show_icon": False,
+        "entities": phases,
+        "grid_options": {"columns": FULL},
+    }
 
 
 def _history_section(chargers: Iterable[ListedCharger]) -> Card:
