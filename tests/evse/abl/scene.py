@@ -21,6 +21,7 @@ READING = 0x2E
 WRITE = 0x10
 
 PATIENCE = 10.0
+FOREVER = 1e6
 # Shorter waits for answers that never come: most tests need not sit through them.
 QUICK = replace(
     PROTOCOL,
@@ -111,6 +112,17 @@ class Scene:
         await until(lambda: charger.available and charger.info is not None)
         await self.polled(charger)
         return charger
+
+    def lively(self, charger: AblCharger) -> None:
+        """End what `quiet` began."""
+        charger.config = replace(charger.config, poll_interval=0.01)
+        charger.slot.ready = 0
+        self.bus.add(charger)
+
+    async def quiet(self, charger: AblCharger) -> None:
+        """Let only commands speak from now on, so that it is known who says what."""
+        charger.config = replace(charger.config, poll_interval=FOREVER)
+        await until(lambda: charger.slot.ready > FOREVER)
 
     async def polled(self, charger: AblCharger, times: int = 2) -> None:
         """Wait for readings that began after this call."""

@@ -227,8 +227,7 @@ async def test_a_box_that_refuses() -> None:
     box = AblBox(1)
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders())
-        charger.slot.ready = float("inf")
-        await asyncio.sleep(0.1)
+        await scene.quiet(charger)
         box.faults.once("replace", b">0190046B\r\n")
         with pytest.raises(ExchangeRefusedError, match="exception 4") as caught:
             await charger.change_orders(OFF)
@@ -236,8 +235,7 @@ async def test_a_box_that_refuses() -> None:
         assert charger.statistics.refused == 1
         assert Fault.LIMIT_NOT_TAKEN in charger.faults
         # The order to pause stands, and is carried out.
-        charger.slot.ready = 0
-        scene.bus.add(charger)
+        scene.lively(charger)
         await until(lambda: Fault.LIMIT_NOT_TAKEN not in charger.faults)
         assert box.ic_amps == 0
 
@@ -246,8 +244,7 @@ async def test_a_lost_answer_is_settled_by_reading() -> None:
     box = AblBox(1)
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders())
-        charger.slot.ready = float("inf")
-        await asyncio.sleep(0.1)
+        await scene.quiet(charger)
         box.faults.once("lose")
         box.faults.once("late", 0.2)
         await charger.change_orders(OFF)

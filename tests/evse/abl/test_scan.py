@@ -1,0 +1,143 @@
+"""A scan finds what is there, says what cannot be told, and writes nothing."""
+
+import asyncio
+from importlib import import_module
+from time import monotonic
+
+import pytest
+
+from custom_components.evse_bus.evse.model import LineLostError, ScanReport
+from tests.virtual import AblBox
+
+from .scene import READING, Scene, config, orders, until
+
+# The package's own name `scan` is the function.
+scanning = import_module("custom_components.evse_bus.evse.abl.scan")
+
+
+@pytest.fixture
+def few_ids(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ask fewer IDs: silence takes its time."""
+    monkeypatch.setattr(scanning, "ADDRESSES", range(1, 7))
+
+
+async def scan(scene: Scene, progress: list[float] | None = None) -> ScanReport:
+    told = [] if progress is None else progress
+    return await scene.protocol.scan(scene.bus, config(), orders(), told.append)
+
+
+def box(address: int, **settings: object) -> AblBox:
+    serial = f"2W22xy{address:08d}"
+    return AblBox(address, serial=serial, **settings)  # type: ignore[arg-type]
+
+
+@pytest.mark.usefixtures("socket_enabled")
+@pytest.mark.parametrize("tcp", [False, True], ids=["pty", "tcp"])
+async def test_boxes_awake_asleep_and_dead(tcp: bool) -> None:  # noqa: FBT001
+    asleep = box(9, sleep_after=5, wakes_on="own")
+    dead = box(4)
+    dead.faults.dead = True
+    boxes = (box(1), dead, asleep, box(16, meter=False))
+    async with Scene(*boxes, tcp=tcp) as scene:
+        progress: list[float] = []
+        report = await scan(scene, progress)
+        assert [(one.address, one.serial) for one in report.found] == [
+            (1, "2W22xy00000001"),
+            (9, "2W22xy00000009"),
+            (16, "2W22xy00000016"),
+        ]
+        assert report.found[0].info.options["meter"] is True
+        assert report.found[2].info.options["meter"] is False
+        assert report.found[0].maximum_current is None
+        assert report.duplicates == ()
+        assert not report.unreadable
+        assert scene.writes() == []
+        assert progress == sorted(progress)
+        assert progress[-1] == 1.0
+        # The sleeper lost one request and was asked again in its time.
+        first, second = [one.t for one in scene.reads(9, 0x01)]
+        assert 0.5 <= second - first <= 1.0
+        assert {len(scene.reads(address, 0x01)) for address in (2, 4, 15)} == {2}
+        # No one else than the sixteen is ever asked.
+        assert {one.device_id for one in scene.requests()} == set(range(1, 17))
+
+
+async def test_an_empty_bus_takes_twice_the_silence_of_sixteen() -> None:
+    async with Scene() as scene:
+        start = monotonic()
+        assert await scan(scene) == ScanReport()
+        silence = scene.protocol.timing.reply_timeout
+        assert monotonic() - start < 32 * (silence + 0.03) + 1.0
+
+
+@pytest.mark.usefixtures("few_ids")
+async def test_two_boxes_with_one_id() -> None:
+    boxes = (
+        AblBox(1, serial="2W22xy00000001", jitter=0.0, turn_round=0.002),
+        AblBox(1, serial="2W22xy00000002", jitter=0.0, turn_round=0.003),
+        box(2),
+    )
+    async with Scene(*boxes) as scene:
+        report = await scan(scene)
+        assert [one.address for one in report.found] == [2]
+        assert report.duplicates == (1,)
+        assert not report.unreadable
+        assert scene.writes() == []
+
+
+@pytest.mark.usefixtures("few_ids")
+async def test_two_new_boxes_alone() -> None:
+    boxes = (
+        AblBox(1, serial="2W22xy00000001", jitter=0.0, turn_round=0.002),
+        AblBox(1, serial="2W22xy00000002", jitter=0.0, turn_round=0.003),
+    )
+    async with Scene(*boxes) as scene:
+        assert await scan(scene) == ScanReport(duplicates=(1,))
+
+
+@pytest.mark.usefixtures("few_ids")
+async def test_one_unreadable_answer_is_no_second_box() -> None:
+    one = box(3)
+    async with Scene(one) as scene:
+        one.faults.once("truncate")
+        report = await scan(scene)
+        assert [found.address for found in report.found] == [3]
+        assert report.duplicates == ()
+
+
+@pytest.mark.usefixtures("few_ids")
+async def test_garbage_everywhere_is_an_unfit_line() -> None:
+    boxes = [box(address) for address in range(1, 6)]
+    for one in boxes:
+        for _ in range(10):
+            one.faults.once("replace", b"\x3e\xb0\xb1\xff\x00\x8d")
+    async with Scene(*boxes) as scene:
+        assert await scan(scene) == ScanReport(unreadable=True)
+
+
+@pytest.mark.usefixtures("few_ids")
+async def test_a_box_without_a_serial_number() -> None:
+    async with Scene(AblBox(1, serial="")) as scene:
+        report = await scan(scene)
+        assert [(one.address, one.serial) for one in report.found] == [(1, None)]
+
+
+@pytest.mark.usefixtures("few_ids")
+async def test_other_chargers_are_polled_meanwhile() -> None:
+    async with Scene(box(1), box(2)) as scene:
+        charger = await scene.settled(config(1), orders())
+        before = len(scene.reads(1, READING))
+        report = await scan(scene)
+        assert [one.address for one in report.found] == [1, 2]
+        assert len(scene.reads(1, READING)) - before > 10
+        assert charger.available
+        assert charger.statistics.timeouts == 0
+
+
+async def test_a_port_lost_meanwhile() -> None:
+    async with Scene(box(1)) as scene:
+        scanned = asyncio.create_task(scan(scene))
+        await until(lambda: len(scene.requests()) > 3)
+        scene.virtual.unplug()
+        with pytest.raises(LineLostError):
+            await scanned
