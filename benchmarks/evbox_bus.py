@@ -47,9 +47,7 @@ async def run(*, quick: bool) -> list[Figure]:
     statistics = bus.wire.statistics
     told = [heard for heard in log if heard.end <= since + elapsed]
     intervals = [
-        interval
-        for serial in SERIALS
-        for interval in gaps(_requests_to(serial, told))
+        interval for serial in SERIALS for interval in gaps(_requests_to(serial, told))
     ]
     on_wire = sum(heard.end - heard.start for heard in told)
     return [
@@ -86,16 +84,12 @@ def _requests_to(serial: int, log: list[Heard]) -> list[float]:
     # STX, destination, source, command; then the serial number's eight digits.
     digits = f"{serial:08d}".encode()
     return [
-        heard.start
-        for heard in log
-        if heard.from_client and heard.data[7:15] == digits
+        heard.start for heard in log if heard.from_client and heard.data[7:15] == digits
     ]
 
 
 def _seconds(name: str, value: float, note: str = "") -> Figure:
-    return Figure(
-        benchmark=NAME, name=name, value=value, unit="s", digits=3, note=note
-    )
+    return Figure(benchmark=NAME, name=name, value=value, unit="s", digits=3, note=note)
 
 
 def _percent(name: str, value: float) -> Figure:

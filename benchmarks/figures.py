@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from typing import Any
 
 
@@ -55,8 +56,7 @@ def percentile(values: Sequence[float], share: float) -> float:
 
 def gaps(times: Iterable[float]) -> list[float]:
     """Return the times between each and the next one."""
-    ordered = list(times)
-    return [after - before for before, after in zip(ordered, ordered[1:], strict=False)]
+    return [after - before for before, after in pairwise(times)]
 
 
 _HEADS = ("benchmark", "figure", "value", "aim", "note")

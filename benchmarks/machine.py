@@ -8,6 +8,7 @@ import platform
 import subprocess
 
 ROOT = Path(__file__).resolve().parent.parent
+OUTPUT = ROOT / ".bench"
 PACKAGES = ("homeassistant", "serialx", "pymodbus", "tmodbus")
 
 
@@ -53,5 +54,5 @@ def _commit() -> str:
             capture_output=True,
             text=True,
         ).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
+    except OSError, subprocess.CalledProcessError:
         return "unknown"

@@ -161,8 +161,9 @@ def _do(bus: VirtualBus, command: dict[str, Any]) -> object:
 
 def _main() -> None:
     spec = json.loads(sys.argv[1])
-    make = {"abl": _abl, "evbox": _evbox}[spec.pop("protocol")]
-    with VirtualBus.pty(*make(**spec), ring=None) as bus:
+    protocol = spec.pop("protocol")
+    devices = _abl(**spec) if protocol == "abl" else _evbox(**spec)
+    with VirtualBus.pty(*devices, ring=None) as bus:
         print(json.dumps(bus.url), flush=True)
         for line in sys.stdin:
             print(json.dumps(_do(bus, json.loads(line))), flush=True)

@@ -1,0 +1,54 @@
+"""Run benchmarks; print a table and write .bench/results.json."""
+
+import argparse
+import asyncio
+import json
+from typing import Final
+
+from . import abl_scan, evbox_bus, exchange_cpu, home_assistant, set_value
+from .figures import Figure, results, table
+from .machine import OUTPUT, machine
+from .progress import say
+
+BENCHMARKS: Final = {
+    one.NAME: one
+    for one in (abl_scan, evbox_bus, set_value, exchange_cpu, home_assistant)
+}
+
+
+def main() -> None:
+    """Run the benchmarks that the command line names, or all."""
+    options = _parser().parse_args()
+    about = machine()
+    figures: list[Figure] = []
+    methods: dict[str, str] = {}
+    for name in options.names or BENCHMARKS:
+        benchmark = BENCHMARKS[name]
+        say(f"-- {name}")
+        figures += asyncio.run(benchmark.run(quick=options.quick))
+        methods[name] = benchmark.METHOD
+    OUTPUT.mkdir(exist_ok=True)
+    path = OUTPUT / "results.json"
+    written = results(figures, about, methods, quick=options.quick)
+    path.write_text(json.dumps(written, indent=2) + "\n", encoding="utf-8")
+    print(", ".join(f"{name} {value}" for name, value in about.items()))
+    for name, method in methods.items():
+        print(f"\n{name}: {method}")
+    print(f"\n{table(figures)}\n\nWritten to {path}")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="scripts/bench",
+        description="Figures of EVSE Bus, on virtual chargers at the wire's pace.",
+        epilog="Names: " + ", ".join(BENCHMARKS),
+    )
+    parser.add_argument("names", nargs="*", choices=BENCHMARKS, metavar="NAME")
+    parser.add_argument(
+        "--quick", action="store_true", help="a short run: rough figures in 5 minutes"
+    )
+    return parser
+
+
+if __name__ == "__main__":
+    main()

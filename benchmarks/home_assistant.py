@@ -1,0 +1,164 @@
+"""(e) What a house with many chargers costs Home Assistant."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from .figures import Figure, percentile
+from .house import LOADED, House
+from .progress import say
+from .setup import ABL_LIMIT, EVBOX_LIMIT
+from .witness import Witness
+
+NAME = "home-assistant"
+METHOD = f"""\
+One real Home Assistant ({LOADED}), started as its own runner does; measured idle,
+then after adding 16 ABL boxes and 8 EVBox ChargePoints of 20 modules (a car charging
+at each), all polled every 5 s as the config flow proposes, on two paced virtual buses
+in processes of their own. CPU: user and system time of all its threads, as a share of
+one core. Memory: resident set after a garbage collection. Blocks: wall time of every
+callback of the event loop (asyncio's Handle._run timed, in a time of its own); what
+other processes of the machine take counts as if it were ours, so idle stands beside
+it. Own time: processor time of the event loop's thread in the longest one."""
+
+IDS = range(1, 17)
+SERIALS = range(1923051, 1923059)
+MODULES = 20
+INTERVAL = 5.0
+LONGEST_BLOCK = 10.0
+"""Aim, ms."""
+
+
+async def run(*, quick: bool) -> list[Figure]:
+    """Return the figures."""
+    seconds = 15.0 if quick else 60.0
+    async with (
+        Witness("abl", ids=list(IDS), plugged=True) as abl,
+        Witness("evbox", serials=list(SERIALS), modules=MODULES) as evbox,
+    ):
+        say("starting Home Assistant")
+        async with House() as house:
+            # What it does after its start is not ours.
+            await house.do("cost", seconds=15.0 if quick else 45.0)
+            say(f"idle, 2 x {seconds:.0f} s")
+            idle = await _measure(house, seconds)
+            say("adding 16 ABL boxes and 8 ChargePoints of 20 modules")
+            adding = await house.do("watched_add", buses=[_abl(abl), _evbox(evbox)])
+            # EVBox: two replies must agree, and until then a box is left alone.
+            await house.do("cost", seconds=30.0)
+            say(f"all polled, 2 x {seconds:.0f} s")
+            polled = await _measure(house, seconds)
+    return _figures(idle, adding, polled)
+
+
+async def _measure(house: House, seconds: float) -> dict[str, Any]:
+    return {
+        **await house.do("cost", seconds=seconds),
+        **await house.do("blocks", seconds=seconds),
+        **await house.do("count"),
+    }
+
+
+def _abl(witness: Witness) -> dict[str, Any]:
+    return {
+        "protocol": "abl",
+        "url": witness.url,
+        "chargers": [
+            {
+                "address": one,
+                "serial": f"2W22xy{one:08d}",
+                "installation_limit": ABL_LIMIT,
+                "poll_interval": INTERVAL,
+                "fail_safe_current": 6.0,
+                "phase_order": [1, 2, 3],
+            }
+            for one in IDS
+        ],
+    }
+
+
+def _evbox(witness: Witness) -> dict[str, Any]:
+    return {
+        "protocol": "evbox",
+        "url": witness.url,
+        "chargers": [
+            {
+                "address": one,
+                "serial": f"{one:08d}",
+                "installation_limit": EVBOX_LIMIT,
+                "poll_interval": INTERVAL,
+                "fail_safe_current": EVBOX_LIMIT,
+                "fail_safe_timeout": 60,
+                "command": 68,
+                "information": "00" * 16,
+            }
+            for one in SERIALS
+        ],
+    }
+
+
+def _figures(
+    idle: Mapping[str, Any], adding: Mapping[str, Any], polled: Mapping[str, Any]
+) -> list[Figure]:
+    new = polled["states"] - idle["states"]
+    rate = polled["changes_per_second"] - idle["changes_per_second"]
+    return [
+        _figure("CPU, idle", idle["cpu"] * 100, "% of a core"),
+        _figure(
+            "CPU, more with all chargers",
+            (polled["cpu"] - idle["cpu"]) * 100,
+            "% of a core",
+            note=f"{new} entities with a state, {rate:.0f} changes/s",
+        ),
+        _figure("memory, idle", idle["memory"] / 1e6, "MB"),
+        _figure(
+            "memory, more with all chargers",
+            (polled["memory"] - idle["memory"]) / 1e6,
+            "MB",
+        ),
+        _figure("longest block, idle", _longest(idle), "ms"),
+        _block("longest block, all polled", polled, aim=LONGEST_BLOCK),
+        _figure(
+            "p99.9 of callbacks, all polled",
+            _p999(polled),
+            "ms",
+            digits=2,
+            note=f"{polled['callbacks']} callbacks",
+        ),
+        _block("longest block while they are added", adding),
+    ]
+
+
+def _block(name: str, blocks: Mapping[str, Any], aim: float | None = None) -> Figure:
+    took, own, what = blocks["longest"][0]
+    note = f"own time {own * 1000:.1f} ms: {what}"
+    return _figure(name, took * 1000, "ms", aim=aim, note=note)
+
+
+def _longest(blocks: Mapping[str, Any]) -> float:
+    return float(blocks["longest"][0][0]) * 1000
+
+
+def _p999(blocks: Mapping[str, Any]) -> float:
+    # Only those above a millisecond are told one by one.
+    short = blocks["callbacks"] - len(blocks["seconds"])
+    return percentile([0.0] * short + blocks["seconds"], 0.999) * 1000
+
+
+def _figure(  # noqa: PLR0913 - one line of the table
+    name: str,
+    value: float,
+    unit: str = "",
+    *,
+    digits: int = 1,
+    aim: float | None = None,
+    note: str = "",
+) -> Figure:
+    return Figure(
+        benchmark=NAME,
+        name=name,
+        value=value,
+        unit=unit,
+        digits=digits,
+        aim=aim,
+        note=note,
+    )
