@@ -186,6 +186,21 @@ def test_a_pause_is_never_merged_away() -> None:
     simulate(scene())
 
 
+def test_the_same_pause_asked_for_twice_is_sent_once() -> None:
+    async def scene() -> None:
+        async with Scene(addresses=(1, 2), interval=0.0, minimum_interval=5.0) as bus:
+            await asyncio.sleep(1)
+            charger = bus.charger(1)
+            asked = now()
+            await asyncio.gather(
+                *(charger.change_orders(OrderChange(allowed=False)) for _ in range(5))
+            )
+            assert now() - asked <= 5.1
+            assert [s.value for s in bus.line.sent if s.command == "W"] == [0]
+
+    simulate(scene())
+
+
 def test_a_pause_supersedes_a_start_that_still_waits() -> None:
     async def scene() -> None:
         async with Scene(addresses=(1, 2), interval=0.0) as bus:

@@ -360,8 +360,8 @@ class Charger(ABC):
 
 
 def _merge_key(change: OrderChange) -> str | None:
-    """Merge limits with limits; permission changes stay jobs of their own."""
-    return "limits" if change.allowed is None else None
+    """Merge limits with limits and pauses with pauses, and nothing with a start."""
+    return {None: "limits", False: "pause", True: None}[change.allowed]
 
 
 async def _no_commit(_orders: Orders) -> None:

@@ -72,7 +72,7 @@ class JobQueue:
         """Merge a job into a waiting one of its kind, and return that, if any.
 
         Only order changes merge, and only before they are under way: the newer
-        wish wins where both speak. A pause carries no merge key.
+        wish wins where both speak. A pause merges with nothing but a pause.
         """
         if job.merge_key is None or job.change is None:
             return None
