@@ -117,7 +117,7 @@ async def test_damaged_bytes_show_nothing_wrong() -> None:
     async with VirtualBus.pty(box) as virtual, ABL.bus(virtual.url) as bus:
         charger = put_on(bus, 1)
         reading = await charger.wait_available()
-        virtual.faults.byte_error_rate = 0.005
+        virtual.faults.byte_error_rate = 0.003
         seen = {reading.connectors[1].raw_state}
 
         def look() -> None:
@@ -125,8 +125,8 @@ async def test_damaged_bytes_show_nothing_wrong() -> None:
                 seen.add(charger.reading.connectors[1].raw_state)
 
         charger.subscribe(look)
-        await asked(virtual, charger, 40)
-        assert charger.statistics.timeouts > 2
+        await asked(virtual, charger, 30)
+        assert charger.statistics.timeouts > 1
         assert seen == {"A1"}
         virtual.faults.clear()
         await charger.wait_available()
