@@ -1,0 +1,83 @@
+"""Library errors as people see them."""
+
+from unittest.mock import patch
+
+from homeassistant.config_entries import ConfigEntries, ConfigEntryState
+from homeassistant.core import HomeAssistant
+from homeassistant.exceptions import HomeAssistantError, ServiceValidationError
+import pytest
+
+from custom_components.evse_bus.errors import not_ready, translated_errors
+from custom_components.evse_bus.evse import model
+from tests.common import setup_bus
+from tests.flow import english
+from tests.virtual import AblBox, VirtualBus
+
+
+def all_errors() -> list[type[model.EvseError]]:
+    return [
+        kind
+        for kind in vars(model).values()
+        if isinstance(kind, type) and issubclass(kind, model.EvseError)
+    ]
+
+
+def make(kind: type[model.EvseError]) -> model.EvseError:
+    if kind is model.WrongChargerError:
+        return model.WrongChargerError("other", expected="1111", found="2222")
+    return kind("the charger's own reason")
+
+
+@pytest.mark.parametrize("kind", all_errors())
+def test_every_error_is_said_in_words(kind: type[model.EvseError]) -> None:
+    with (
+        pytest.raises(HomeAssistantError) as said,
+        translated_errors("Garage", "/dev/ttyUSB0"),
+    ):
+        raise make(kind)
+    error = said.value
+    text = english()["exceptions"][error.translation_key]["message"]
+    shown = text.format(**error.translation_placeholders)
+    assert "Garage" in shown or "/dev/ttyUSB0" in shown
+    assert isinstance(error.__cause__, kind)
+    # A wish that cannot be meant is the caller's mistake, all else is not.
+    assert isinstance(error, ServiceValidationError) == issubclass(
+        kind, model.RefusedOrderError
+    )
+
+
+def test_a_wrong_charger_is_named() -> None:
+    with pytest.raises(HomeAssistantError) as said, translated_errors("Garage", "p"):
+        raise make(model.WrongChargerError)
+    assert said.value.translation_placeholders["found"] == "2222"
+    assert said.value.translation_placeholders["expected"] == "1111"
+
+
+def test_the_chargers_own_reason_is_kept() -> None:
+    with pytest.raises(HomeAssistantError) as said, translated_errors("Garage", "p"):
+        raise model.ExchangeRefusedError("exception code 3", 3)
+    assert said.value.translation_placeholders["error"] == "exception code 3"
+
+
+def test_ports_differ() -> None:
+    kinds = (
+        model.PortMissingError,
+        model.PortBusyError,
+        model.PortPermissionError,
+        model.PortSettingsError,
+        model.LineError,
+    )
+    keys = {not_ready(kind("why"), "/dev/ttyUSB0").translation_key for kind in kinds}
+    assert len(keys) == len(kinds)
+
+
+async def test_a_platform_that_fails_does_not_keep_the_port(
+    hass: HomeAssistant,
+) -> None:
+    with VirtualBus.pty(AblBox(1)) as bus:
+        with patch.object(
+            ConfigEntries, "async_forward_entry_setups", side_effect=RuntimeError
+        ):
+            entry = await setup_bus(hass, "abl", bus.url)
+        assert entry.state is ConfigEntryState.SETUP_ERROR
+        await bus.wait_for_async(lambda: not bus.connected)
