@@ -37,6 +37,9 @@ def main() -> int:
     except DemoError as error:
         say(f"FAILED: {error}")
         return 1
+    except KeyboardInterrupt:
+        # Before anything was started.
+        return 130
     return 0
 
 

@@ -32,8 +32,10 @@ async def furnish(client: Client, settings: Settings) -> None:
 
 async def _add_bus(client: Client, settings: Settings, bus: DemoBus) -> bool:
     port = str(settings.link(bus.protocol))
-    with Progress(f"{bus.title}: going through the config flow") as progress:
-        return await add_entry(client, DOMAIN, bus.answers(port), progress.show)
+    with Progress(f"{bus.title}: config flow") as progress:
+        new = await add_entry(client, DOMAIN, bus.answers(port), progress.show)
+        progress.outcome = "gone through" if new else "knows this bus already"
+        return new
 
 
 async def _listed(client: Client) -> list[ListedBus]:

@@ -21,6 +21,7 @@ class Progress:
 
     def __init__(self, title: str, clock: Callable[[], float] = time.monotonic) -> None:
         """Begin now."""
+        self.outcome = "done"
         self._title = title
         self._clock = clock
         self._begin = clock()
@@ -40,7 +41,7 @@ class Progress:
         if self._live:
             sys.stdout.write("\r" + " " * WIDTH + "\r")
         if kind is None:
-            say(f"{self._title}: done ({self.seconds:.0f} s)")
+            say(f"{self._title}: {self.outcome} ({self.seconds:.0f} s)")
 
     @property
     def seconds(self) -> float:

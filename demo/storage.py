@@ -32,6 +32,8 @@ logger:
   default: warning
   logs:
     custom_components.evse_bus: info
+    # Says so when something must be downloaded; requirements_demo.txt lists it all.
+    homeassistant.util.package: info
     # Comes with the frontend, and misses programs that no charger needs.
     haffmpeg: critical
     homeassistant.components.camera.img_util: critical
