@@ -220,7 +220,6 @@ class Bus:
 
     async def _poll_turn(self, charger: Charger) -> None:
         loop = asyncio.get_running_loop()
-        before = charger.told
         charger.expire_orders(loop.time())
         try:
             later = await charger.poll(Talk(self.wire, charger.statistics))
@@ -247,7 +246,7 @@ class Bus:
         charger.plan(now)
         if later is not None:
             self._follow_up(charger, later, Persistence.STANDING)
-        if charger.told != before:
+        if charger.told != charger.last_told:
             charger.updated()
 
     def _skip_poll(self, charger: Charger, error: LineError) -> None:

@@ -59,6 +59,8 @@ class Charger(ABC):
         self.reading: ChargerReading | None = None
         self.info: ChargerInfo | None = None
         self.statistics = ChargerStatistics()
+        self.last_told: tuple[object, ...] = ()
+        """What `told` was when the listeners were told last."""
         self.misses = 0
         """Requests left unanswered in a row."""
         self.available = False
@@ -331,6 +333,7 @@ class Charger(ABC):
 
     def updated(self) -> None:
         """Tell the listeners."""
+        self.last_told = self.told
         for listener in tuple(self._listeners):
             listener()
 

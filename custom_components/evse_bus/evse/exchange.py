@@ -5,6 +5,7 @@ Frames that answer nothing are handed on, or counted as other people's.
 
 import asyncio
 from collections.abc import Callable
+from math import inf
 from typing import Final
 
 from .framing import Frame, Framer, Timing
@@ -125,9 +126,9 @@ class Wire:
         framer = self._framer
         bad, noise = framer.bad, framer.noise
         frames = framer.feed(data)
-        self.statistics.bad_frames += framer.bad - bad
-        self.statistics.noise_bytes += framer.noise - noise
         if framer.bad > bad or framer.noise > noise:
+            self.statistics.bad_frames += framer.bad - bad
+            self.statistics.noise_bytes += framer.noise - noise
             self.frames.add(Direction.UNREADABLE, data)
         for frame in frames:
             self.statistics.frames += 1
@@ -205,7 +206,8 @@ class _PendingReply:
         self.answered_at: float | None = None
         self._accept = accept
         self._gap = gap
-        self._until = first_byte_by
+        self._first_byte_by = first_byte_by
+        self._heard_at = -inf
         # Noise that never ends must not hold the bus: this is the worst case.
         self._last_chance = first_byte_by + longest + gap
         self._timer = self._loop.call_at(first_byte_by, self._time_is_up)
@@ -227,9 +229,7 @@ class _PendingReply:
 
     def goes_on(self) -> None:
         """Give a frame that has begun the time to end."""
-        self._until = min(
-            max(self._until, self._loop.time() + self._gap), self._last_chance
-        )
+        self._heard_at = self._loop.time()
 
     def fail(self, error: EvseError) -> None:
         """End the wait without an answer."""
@@ -239,8 +239,10 @@ class _PendingReply:
     def _time_is_up(self) -> None:
         if self.future.done():
             return
-        if self._until > self._loop.time():
-            self._timer = self._loop.call_at(self._until, self._time_is_up)
+        until = max(self._first_byte_by, self._heard_at + self._gap)
+        until = min(until, self._last_chance)
+        if until > self._loop.time():
+            self._timer = self._loop.call_at(until, self._time_is_up)
             return
         self.future.set_exception(ReplyTimeoutError("no answer in time"))
 
