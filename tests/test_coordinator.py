@@ -171,21 +171,39 @@ async def test_only_listeners_of_what_changed_are_called(hass: HomeAssistant) ->
             stop()
 
 
-async def test_a_quiet_charger_writes_no_states(hass: HomeAssistant) -> None:
-    """Modules that tell what they told before cost nothing."""
-    box = EvboxChargePoint(1923054, [Module(), Module(), Module()], min_interval=0)
-    async with running(hass, box, poll_interval=0.1) as (entry, bus):
-        energy = await get_entity(hass, "sensor", entry, "3_energy")
+async def test_only_what_changed_is_written(hass: HomeAssistant) -> None:
+    """A module that charges costs its own entities, and of them those that move."""
+    car = Car(reaction=0.0, ramp=8.0)
+    box = EvboxChargePoint(1923054, [Module(car), Module()], min_interval=0)
+    async with running(hass, box, poll_interval=0.1, fail_safe_current=16.0) as (
+        entry,
+        _,
+    ):
+        energy = await get_entity(hass, "sensor", entry, "2_energy")
         await wait_for_state(hass, energy, lambda state: float(state.state) >= 0)
         await hass.async_block_till_done()
-        written: list[str] = []
-        for event in (EVENT_STATE_CHANGED, EVENT_STATE_REPORTED):
+        coordinator = entry.runtime_data
+        called: set[int] = set()
+        for number in (1, 2):
+            coordinator.async_add_listener(
+                lambda number=number: called.add(number), ("evbox1923054", number)
+            )
+        changed: set[str] = set()
+        reported: set[str] = set()
+        for name, ids in (
+            (EVENT_STATE_CHANGED, changed),
+            (EVENT_STATE_REPORTED, reported),
+        ):
             hass.bus.async_listen(
-                event,
-                callback(lambda event: written.append(event.data["entity_id"])),
+                name,
+                callback(lambda event, ids=ids: ids.add(event.data["entity_id"])),
                 event_filter=callback(lambda _data: True),
             )
-        polls = len(box.orders)
-        await bus.wait_for_async(lambda: len(box.orders) > polls + 2)
-        await hass.async_block_till_done()
-        assert not written
+        car.plug_in()
+        power = entity_id(hass, "sensor", entry, "1_power")
+        await wait_for_state(hass, power, lambda state: float(state.state) > 3000)
+        assert called == {1}
+        assert power in changed
+        assert all("module_1" in one for one in changed)
+        # Nothing was written that was there already.
+        assert not reported
