@@ -1,7 +1,6 @@
 """Setting up, changing and taking down a bus in Home Assistant."""
 
 import asyncio
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 import socket
@@ -19,14 +18,12 @@ from homeassistant.helpers import (
 )
 import pytest
 
-from custom_components.evse_bus import async_remove_config_entry_device
-from custom_components.evse_bus.const import DOMAIN, SUBENTRY_CHARGER
+from custom_components.evse_bus.const import DOMAIN
 from tests.common import (
     bus_entry,
     call,
     charger,
     charger_of,
-    entity_id,
     get_entity,
     running,
     setup_bus,
@@ -34,7 +31,7 @@ from tests.common import (
     wait_for_state,
     wait_until,
 )
-from tests.virtual import AblBox, Car, EvboxChargePoint, VirtualBus, requests_in
+from tests.virtual import AblBox, Car, VirtualBus, requests_in
 
 
 def open_files() -> set[str]:
@@ -182,42 +179,6 @@ async def test_removal_leaves_nothing(
     assert not hass.states.async_all()
 
 
-async def test_devices_hang_together(hass: HomeAssistant) -> None:
-    async with running(hass, EvboxChargePoint(1923054, 2), poll_interval=1.0) as (
-        entry,
-        _,
-    ):
-        await get_entity(hass, "sensor", entry, "2_power")
-        devices = dr.async_get(hass)
-        find = devices.async_get_device_by_identifier
-        bus = find((DOMAIN, "bus"), "bus")
-        box = find((DOMAIN, "evbox1923054"), "bus")
-        assert bus.via_device_id is None
-        assert bus.config_subentry_id is None
-        assert box.via_device_id == bus.id
-        assert box.config_subentry_id == "evbox1923054"
-        assert (box.manufacturer, box.serial_number) == ("EVBox", "1923054")
-        for number in (1, 2):
-            module = devices.async_get_child_device_by_identifier(
-                (DOMAIN, f"evbox1923054_{number}"), "bus"
-            )
-            assert module.parent_device_id == box.id
-            assert module.name == f"Module {number}"
-            power = entity_id(hass, "sensor", entry, f"{number}_power")
-            assert er.async_get(hass).async_get(power).device_id == module.id
-
-
-async def test_the_only_connector_is_no_device(hass: HomeAssistant) -> None:
-    async with running(hass, AblBox(3)) as (entry, _):
-        status = await get_entity(hass, "sensor", entry, "1_status")
-        box = dr.async_get(hass).async_get_device_by_identifier((DOMAIN, "abl3"), "bus")
-        assert er.async_get(hass).async_get(status).device_id == box.id
-        assert (box.manufacturer, box.sw_version) == ("ABL", "1.2")
-        assert not dr.async_get(hass).async_get_child_device_by_identifier(
-            (DOMAIN, "abl3_1"), "bus"
-        )
-
-
 def add_charger(hass: HomeAssistant, entry: ConfigEntry, data: dict[str, Any]) -> None:
     fields = {**data, "data": MappingProxyType(data["data"])}
     hass.config_entries.async_add_subentry(entry, ConfigSubentry(**fields))
@@ -356,64 +317,3 @@ async def test_a_charger_that_nobody_had_a_serial_number_for(
         assert state_of(hass, status) == "available"
         assert bus.opened == 1
         await hass.config_entries.async_unload(entry.entry_id)
-
-
-@pytest.fixture
-def two_modules() -> Iterator[EvboxChargePoint]:
-    return EvboxChargePoint(1923054, 2)
-
-
-async def test_a_module_that_is_gone_can_be_deleted(
-    hass: HomeAssistant, two_modules: EvboxChargePoint
-) -> None:
-    async with running(hass, two_modules, poll_interval=1.0) as (entry, _):
-        power = await get_entity(hass, "sensor", entry, "2_power")
-        devices = dr.async_get(hass)
-        module = devices.async_get_child_device_by_identifier(
-            (DOMAIN, "evbox1923054_2"), "bus"
-        )
-        for device in (
-            devices.async_get_device_by_identifier((DOMAIN, "bus"), "bus"),
-            devices.async_get_device_by_identifier((DOMAIN, "evbox1923054"), "bus"),
-            module,
-        ):
-            assert not await async_remove_config_entry_device(hass, entry, device)
-
-        two_modules.remove_module()
-        await wait_for_state(hass, power, "unavailable")
-        assert await async_remove_config_entry_device(hass, entry, module)
-        devices.async_remove_device(module.id)
-        await hass.async_block_till_done()
-        assert hass.states.get(power) is None
-
-        # It comes back as a module that was never seen.
-        two_modules.add_module()
-        await get_entity(hass, "sensor", entry, "2_power")
-
-
-async def test_the_second_module_makes_devices_of_both(hass: HomeAssistant) -> None:
-    # A box that answers at once after a reload: it asks for no interval.
-    box = EvboxChargePoint(1923054, 1, min_interval=0)
-    async with running(hass, box, poll_interval=1.0) as (entry, _):
-        first = await get_entity(hass, "sensor", entry, "1_power")
-        entities = er.async_get(hass)
-        charger_id = entities.async_get(first).device_id
-        box.add_module()
-        second = await get_entity(hass, "sensor", entry, "2_power")
-        assert entities.async_get(first).device_id != charger_id
-        parents = {
-            dr.async_get(hass)
-            .async_get(entities.async_get(one).device_id)
-            .parent_device_id
-            for one in (first, second)
-        }
-        assert parents == {charger_id}
-        assert state_of(hass, first) == "0.0"
-
-        # So it stays, also when only one is left at the next start.
-        box.remove_module()
-        await wait_for_state(hass, second, "unavailable")
-        await hass.config_entries.async_reload(entry.entry_id)
-        await wait_for_state(hass, first, "0.0")
-        assert entities.async_get(first).device_id != charger_id
-        assert entry.subentries["evbox1923054"].subentry_type == SUBENTRY_CHARGER
