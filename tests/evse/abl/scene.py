@@ -27,7 +27,7 @@ QUICK = replace(
     PROTOCOL,
     timing=replace(
         PROTOCOL.timing,
-        reply_timeout=0.15,
+        reply_timeout=0.12,
         retry_pauses=(0.05, 0.05),
         backoff=0.1,
         backoff_limit=0.2,
@@ -76,7 +76,8 @@ class Scene:
 
     def __init__(self, *boxes: AblBox, tcp: bool = False, quick: bool = True) -> None:
         make = VirtualBus.tcp if tcp else VirtualBus.pty
-        self.virtual = make(*boxes)
+        # A faster wire, too: what is paced as the real one is measured elsewhere.
+        self.virtual = make(*boxes, baud=384_000 if quick else 38_400, parity="E")
         self.protocol = QUICK if quick else PROTOCOL
         self.boxes = boxes
         self.bus: Bus
@@ -108,7 +109,7 @@ class Scene:
         """Put a charger on the bus; return when it has said all it says at first."""
         charger = self.add(settings, wanted)
         # Not asked for the register that most boxes do not know: silence costs 0.3 s.
-        charger._tells_icmax = False
+        charger.tells_icmax = False
         await until(lambda: charger.available and charger.info is not None)
         await self.polled(charger)
         return charger

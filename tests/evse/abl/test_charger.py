@@ -26,7 +26,7 @@ def plugged(**settings: float) -> Car:
 @pytest.mark.parametrize("tcp", [False, True], ids=["pty", "tcp"])
 async def test_a_car_charges(tcp: bool) -> None:  # noqa: FBT001
     box = AblBox(1, car=plugged(max_current=12, phases=2, ramp=0.1, reaction=0.0))
-    async with Scene(box, tcp=tcp) as scene:
+    async with Scene(box, tcp=tcp, quick=False) as scene:
         charger = await scene.settled(config(), orders(10))
         await until(
             lambda: (
@@ -132,7 +132,7 @@ async def test_an_answer_to_another_request_changes_nothing() -> None:
         before = scene.bus.wire.statistics.foreign_frames
         await until(lambda: not charger.available)
         assert charger.reading is None
-        assert scene.bus.wire.statistics.foreign_frames >= before + 3
+        assert scene.bus.wire.statistics.foreign_frames > before
         scene.boxes[0].answer_register = None
         await until(lambda: charger.available)
 

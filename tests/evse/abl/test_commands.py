@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from custom_components.evse_bus.evse.abl import commands
+from custom_components.evse_bus.evse.abl.dialogue import Dialogue, Pauses
 from custom_components.evse_bus.evse.model import (
     Command,
     DuplicateAddressError,
@@ -24,20 +24,14 @@ RESET, A1, E0, E2 = 0x5A5A, 0xA1A1, 0xE0E0, 0xE2E2
 PAUSE = 1000
 
 
-WAKE_PAUSE = commands.WAKE_PAUSE
+REAL = Dialogue.pauses
+SHORT = Pauses(wake=0.3, setup=0.03, boot=0.08, retry=0.2, verify=0.05)
 
 
 @pytest.fixture(autouse=True)
 def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the virtual car wake, and the virtual box start, sooner than real ones."""
-    for name, pause in (
-        ("WAKE_PAUSE", 0.3),
-        ("SETUP_PAUSE", 0.03),
-        ("BOOT_PAUSE", 0.08),
-        ("VERIFY_PAUSE", 0.05),
-        ("RETRY_PAUSE", 0.2),
-    ):
-        monkeypatch.setattr(commands, name, pause)
+    monkeypatch.setattr(Dialogue, "pauses", SHORT)
 
 
 def sleepy() -> Car:
@@ -161,7 +155,7 @@ async def test_an_outlet_is_on_or_off(value: object) -> None:
 
 
 async def test_a_car_is_woken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(commands, "WAKE_PAUSE", WAKE_PAUSE)
+    monkeypatch.setattr(Dialogue, "pauses", REAL)
     box = box_with(sleepy())
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders())
@@ -174,7 +168,7 @@ async def test_a_car_is_woken(monkeypatch: pytest.MonkeyPatch) -> None:
         # The others were heard meanwhile: it did not hold the bus.
         assert len(scene.reads(1)) > 20
         assert box.state != "E0"
-        assert not charger.owes_a1
+        assert charger.owes is None
 
 
 async def test_only_a_car_that_may_charge_is_woken() -> None:
@@ -456,3 +450,18 @@ async def test_nothing_is_ever_said_to_all() -> None:
         await charger.change_orders(OrderChange(current=8))
         assert {one.device_id for one in scene.requests()} <= {1, 5}
         assert scene.writes(LIMIT) == [133]
+
+
+async def test_a_port_lost_in_the_set_up_mode() -> None:
+    box = box_with()
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders())
+        setting = asyncio.create_task(charger.command(Command.SET_ADDRESS, 2))
+        await until(lambda: box.state == "E2")
+        scene.virtual.unplug()
+        with pytest.raises(EvseError):
+            await setting
+        scene.virtual.replug()
+        await until(lambda: box.state == "A1")
+        await until(lambda: charger.owes is None)
+        assert charger.config.address == box.device_id

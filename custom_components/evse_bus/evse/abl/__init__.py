@@ -5,7 +5,8 @@ from typing import Final
 from ..framing import LineSettings
 from ..modbus import AsciiFramer
 from ..protocol import Protocol
-from .charger import TIMING, AblCharger, AblConfig
+from .charger import AblCharger
+from .reader import TIMING, AblConfig
 from .scan import scan
 
 PROTOCOL: Final = Protocol(

@@ -7,16 +7,13 @@ back, also when something fails.
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Final, assert_never
+from typing import TYPE_CHECKING, assert_never
 
 from ..exchange import Talk
 from ..model import (
     Command,
-    DuplicateAddressError,
-    EvseError,
-    ExchangeError,
     ExchangeRefusedError,
     NotAvailableError,
     NotConfirmedError,
@@ -25,52 +22,35 @@ from ..model import (
     ReplyTimeoutError,
 )
 from ..turns import Turns
+from .dialogue import Debt, Dialogue
 from .duty import PAUSE, is_within
-from .exchanges import configure, read, set_state
 from .registers import (
     ADDRESSES,
-    INFO,
-    SERIAL,
-    Reading,
     StateCode,
-    decode_serial,
     limit_duty,
 )
-from .states import A1, B2, E0, E2, state_of
+from .setup import Settings, SetUp
+from .states import B2, E0, E2, state_of
 
 if TYPE_CHECKING:
     from .charger import AblCharger
 
-WAKE_PAUSE: Final = 3.0
-"""Time without a pilot signal that wakes a car (PROTOCOLS.md, 2), s."""
-SETUP_PAUSE: Final = 0.5
-"""Pause between the writes of a set-up (PROTOCOLS.md, 2), s."""
-BOOT_PAUSE: Final = 0.6
-"""Pause between two looks for a box that has been reset, s."""
-BOOT_LOOKS: Final = 10
-RETRY_PAUSE: Final = 0.4
-"""Pause after a first request that a sleeping box has lost, s."""
-VERIFY_PAUSE: Final = 0.3
-LOOKS: Final = 4
-"""How often a state is looked at until it must have been reached."""
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Busy:
+    """The one command under way."""
+
+    what: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Setup:
-    """What is to be set in register 0x002C; ``None``: stays as it is."""
-
-    device_id: int | None = None
-    upstream_timeout: bool | None = None
-    needs_enable: bool | None = None
-
-
-class CommandSet:
+class CommandSet(Dialogue):
     """The commands of one charger; one at a time."""
 
     def __init__(self, charger: AblCharger) -> None:
         """Take the charger, for its identity, its readings and its limit."""
-        self._charger = charger
-        self._busy: Command | None = None
+        super().__init__(charger)
+        self._set_up = SetUp(charger)
+        self._busy: _Busy | None = None
 
     def conversation(
         self, command: Command, value: object
@@ -95,73 +75,38 @@ class CommandSet:
                 # It begins with a look at the state: twice does what once does.
                 return turns, Persistence.REPEATABLE
             case Command.SET_ADDRESS:
-                setup = _Setup(device_id=_device_id(value))
+                settings = Settings(device_id=_device_id(value))
             case Command.SET_UPSTREAM_TIMEOUT:
-                setup = _Setup(upstream_timeout=_on_or_off(command, value))
+                settings = Settings(upstream_timeout=_on_or_off(command, value))
             case Command.SET_ENABLE_AFTER_POWER_CYCLE:
-                setup = _Setup(needs_enable=not _on_or_off(command, value))
+                settings = Settings(needs_enable=not _on_or_off(command, value))
             case _:
                 assert_never(command)
-        return partial(self._set_up, setup), Persistence.ONCE
+        return partial(self._set_up.run, settings), Persistence.ONCE
+
+    def release(self) -> None:
+        """Forget the command under way: it was cut short."""
+        self._busy = None
 
     def _one_at_a_time(
-        self, command: Command, turns: Callable[[Talk], Turns]
+        self, command: Command | None, turns: Callable[[Talk], Turns]
     ) -> Callable[[Talk], Turns]:
         async def conversation(talk: Talk) -> Turns:
             if self._busy is not None:
-                message = f"{self._charger.config.name} is busy: {self._busy}"
+                message = f"{self._charger.config.name} is busy: {self._busy.what}"
                 raise NotAvailableError(message)
             token = self._charger.begin()
-            self._busy = command
+            self._busy = mine = _Busy(command or "tidying up")
             try:
                 async for pause in turns(talk):
                     yield pause
             finally:
-                self._busy = None
+                if self._busy is mine:
+                    self._busy = None
                 self._charger.end(token)
                 self._charger.updated()
 
         return conversation
-
-    # -- Parts -------------------------------------------------------------------
-
-    async def _reach(self, talk: Talk) -> Turns:
-        """Wake the box itself: nothing has been written, so asking again is safe."""
-        for last in (False, False, True):
-            try:
-                await self._charger.identify(talk)
-                await self._charger.look(talk)
-            except ReplyTimeoutError:
-                if last:
-                    raise
-            else:
-                return
-            yield RETRY_PAUSE
-
-    def _state(self) -> Reading:
-        """Return the last reading."""
-        if self._charger.raw is None:
-            message = f"{self._charger.config.name} has told no state"
-            raise NotAvailableError(message)
-        return self._charger.raw
-
-    async def _say(self, talk: Talk, code: StateCode) -> bool:
-        """Write a state code, once; return whether it was confirmed."""
-        try:
-            await set_state(talk, self._charger.config.address, code)
-        except ReplyTimeoutError:
-            return False
-        return True
-
-    def _hold_polls(self, talk: Talk) -> None:
-        """Let no regular exchange come between: the box is off or moving."""
-        slot = self._charger.slot
-        slot.ready = max(slot.ready, talk.now + 2 * BOOT_PAUSE)
-
-    def _refuse_in(self, reading: Reading, what: str) -> NotAvailableError:
-        name = self._charger.config.name
-        state = state_of(reading.state).name
-        return NotAvailableError(f"{name} is in state {state}: {what}")
 
     # -- Outlet ------------------------------------------------------------------
 
@@ -193,27 +138,11 @@ class CommandSet:
             talk, StateCode.A1, lambda now: now.state not in (E0, E2)
         ):
             yield pause
-        charger.owes_a1 = False
+        charger.owes = None
         if not paused and self._state().duty < limit_duty(charger.setpoint) != PAUSE:
             # Limits raised while the outlet was disabled have only been stored.
             async for pause in charger.enforce(talk, lambda: charger.setpoint):
                 yield pause
-
-    async def _reach_state(
-        self, talk: Talk, code: StateCode, reached: Callable[[Reading], bool]
-    ) -> Turns:
-        """Write a state code and see that it works; again only if it was lost."""
-        confirmed = await self._say(talk, code)
-        for _ in range(LOOKS):
-            if reached(await self._charger.look(talk)):
-                return
-            if not confirmed:
-                confirmed = await self._say(talk, code)
-            yield VERIFY_PAUSE
-        if reached(await self._charger.look(talk)):
-            return
-        message = f"{self._charger.config.name} does not follow {code.name}"
-        raise NotConfirmedError(message)
 
     # -- Waking a car ------------------------------------------------------------
 
@@ -226,42 +155,26 @@ class CommandSet:
             raise self._refuse_in(reading, "only a car that may charge can be woken")
         if reading.duty == PAUSE or charger.setpoint.paused:
             raise self._refuse_in(reading, "charging is paused, waking would not help")
-        charger.owes_a1 = True
+        charger.owes = Debt(E0, StateCode.A1)
         try:
             confirmed = await self._say(talk, StateCode.E0)
         except ExchangeRefusedError:
-            charger.owes_a1 = False
+            charger.owes = None
             raise
         if not confirmed:
             # If the state is not told either, E0 must be assumed.
             with suppress(ReplyTimeoutError):
                 if (await charger.look(talk)).state != E0:
-                    charger.owes_a1 = False
+                    charger.owes = None
                     message = f"{charger.config.name} did not take E0"
                     raise NotConfirmedError(message)
-        yield WAKE_PAUSE
-        async for pause in self._enable_again(talk):
+        yield self.pauses.wake
+        async for pause in self._give_back(talk):
             yield pause
 
-    def enable_again(self, talk: Talk) -> Turns:
-        """Give back an outlet that we disabled and could not enable again."""
-        return self._one_at_a_time(Command.WAKE, self._enable_again)(talk)
-
-    async def _enable_again(self, talk: Talk) -> Turns:
-        charger = self._charger
-        for _ in range(LOOKS):
-            # It must end with the outlet enabled: a lost exchange is tried again.
-            with suppress(ExchangeError):
-                if (await charger.look(talk)).state != E0:
-                    charger.owes_a1 = False
-                    return
-                await self._say(talk, StateCode.A1)
-                if (await charger.look(talk)).state != E0:
-                    charger.owes_a1 = False
-                    return
-            yield VERIFY_PAUSE
-        message = f"{charger.config.name}: the outlet is still disabled"
-        raise NotConfirmedError(message)
+    def give_back(self, talk: Talk) -> Turns:
+        """Finish what a command that was cut short has left undone."""
+        return self._one_at_a_time(None, self._give_back)(talk)
 
     # -- Reset -------------------------------------------------------------------
 
@@ -280,163 +193,6 @@ class CommandSet:
                 "nothing shows whether it happened; it was not repeated"
             )
             raise NotConfirmedError(message)
-
-    async def _after_reset(self, talk: Talk, *, was_disabled: bool) -> Turns:
-        """Wait for a box to come back; then nothing may be open that was closed.
-
-        A reset ends in A1 with Idefault: neither the limit nor E0 has survived it.
-        """
-        charger = self._charger
-        charger.forget()
-        for look in range(BOOT_LOOKS):
-            self._hold_polls(talk)
-            yield BOOT_PAUSE
-            self._hold_polls(talk)
-            try:
-                await charger.identify(talk)
-                await charger.look(talk)
-                break
-            except ReplyTimeoutError:
-                if look == BOOT_LOOKS - 1:
-                    raise
-        if not is_within(self._state().duty, limit_duty(charger.setpoint)):
-            async for pause in charger.enforce(talk, lambda: charger.setpoint):
-                yield pause
-        if was_disabled and self._state().state != E0:
-            async for pause in self._reach_state(
-                talk, StateCode.E0, lambda now: now.state == E0
-            ):
-                yield pause
-
-    # -- Set-up ------------------------------------------------------------------
-
-    async def _set_up(self, setup: _Setup, talk: Talk) -> Turns:
-        """Set device-ID or settings: E2, 0x002C, reset; then see that it is so."""
-        charger = self._charger
-        async for pause in self._reach(talk):
-            yield pause
-        old = charger.config.address
-        new = old if setup.device_id is None else setup.device_id
-        if setup.device_id == old:
-            return
-        before = self._state()
-        serial = self._check_ready(before)
-        if new != old:
-            async for pause in self._make_sure_free(talk, new):
-                yield pause
-        try:
-            async for pause in self._write_setup(talk, setup, new):
-                yield pause
-        except EvseError:
-            # Out of the set-up mode again, whatever went wrong.
-            with suppress(EvseError):
-                back = StateCode.E0 if before.state == E0 else StateCode.A1
-                await set_state(talk, old, back)
-            raise
-        charger.forget()
-        async for pause in self._move(talk, new, serial):
-            yield pause
-        async for pause in self._after_reset(talk, was_disabled=before.state == E0):
-            yield pause
-        await charger.read_flags(talk)
-        self._check_settings(setup)
-
-    def _check_ready(self, reading: Reading) -> str:
-        """Return the serial number of a box that can be set up now.
-
-        Raises NotAvailableError.
-        """
-        if reading.state not in (A1, E0):
-            raise self._refuse_in(reading, "only in A1 and E0 can it be set up")
-        if (serial := self._charger.serial) is None:
-            message = (
-                f"{self._charger.config.name} tells no serial number: it cannot be "
-                "told from another box with the same device-ID"
-            )
-            raise NotAvailableError(message)
-        return serial
-
-    async def _make_sure_free(self, talk: Talk, address: int) -> Turns:
-        """Raise DuplicateAddressError when somebody has that address already."""
-        bus = self._charger.bus
-        others = bus.chargers.values() if bus is not None else ()
-        taken = any(other.config.address == address for other in others)
-        for ask in range(2):
-            if taken:
-                break
-            with suppress(ReplyTimeoutError):
-                await read(talk, address, INFO)
-                taken = True
-            if not ask:
-                # A box asleep loses the first request.
-                yield RETRY_PAUSE
-        if taken:
-            message = f"device-ID {address} is taken already"
-            raise DuplicateAddressError(message)
-
-    async def _write_setup(self, talk: Talk, setup: _Setup, new: int) -> Turns:
-        self._hold_polls(talk)
-        async for pause in self._reach_state(
-            talk, StateCode.E2, lambda now: now.state == E2
-        ):
-            yield pause
-        self._hold_polls(talk)
-        yield SETUP_PAUSE
-        self._hold_polls(talk)
-        write = partial(
-            configure,
-            talk,
-            self._charger.config.address,
-            new,
-            upstream_timeout=setup.upstream_timeout,
-            needs_enable=setup.needs_enable,
-        )
-        try:
-            await write()
-        except ReplyTimeoutError:
-            # It cannot be read before the reset; the same value twice is the same.
-            await write()
-        yield SETUP_PAUSE
-        self._hold_polls(talk)
-        if not await self._say(talk, StateCode.RESET):
-            with suppress(ReplyTimeoutError):
-                if (await self._charger.look(talk)).state == E2:
-                    await self._say(talk, StateCode.RESET)
-
-    async def _move(self, talk: Talk, new: int, serial: str) -> Turns:
-        """Find the box at its new address, by its serial number; then go there."""
-        charger = self._charger
-        if new == charger.config.address:
-            return
-        for _ in range(BOOT_LOOKS):
-            self._hold_polls(talk)
-            yield BOOT_PAUSE
-            self._hold_polls(talk)
-            with suppress(ReplyTimeoutError):
-                found = decode_serial(await read(talk, new, SERIAL))
-                if found == serial:
-                    charger.config = replace(charger.config, address=new)
-                    return
-        message = (
-            f"{charger.config.name} was not found at device-ID {new}; "
-            f"it is still expected at {charger.config.address}"
-        )
-        raise NotConfirmedError(message)
-
-    def _check_settings(self, setup: _Setup) -> None:
-        """Raise NotConfirmedError when a setting is not as it was set."""
-        charger = self._charger
-        options = charger.info.options if charger.info is not None else {}
-        wanted = {
-            "upstream_timeout": setup.upstream_timeout,
-            "enable_after_power_cycle": (
-                None if setup.needs_enable is None else not setup.needs_enable
-            ),
-        }
-        for name, value in wanted.items():
-            if value is not None and options.get(name) is not value:
-                message = f"{charger.config.name} did not take {name} = {value}"
-                raise NotConfirmedError(message)
 
 
 def _on_or_off(command: Command, value: object) -> bool:

@@ -1,0 +1,163 @@
+"""What the commands of an ABL box are made of.
+
+Register 0x0005 is never written twice for one wish: after a lost answer the state is
+read, and decides.
+"""
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Final
+
+from ..exchange import Talk
+from ..model import (
+    ExchangeError,
+    NotAvailableError,
+    NotConfirmedError,
+    ReplyTimeoutError,
+)
+from ..turns import Turns
+from .duty import is_within
+from .exchanges import set_state
+from .registers import Reading, StateCode, limit_duty
+from .states import E0, state_of
+
+if TYPE_CHECKING:
+    from .charger import AblCharger
+
+BOOT_LOOKS: Final = 10
+"""How often a box that has been reset is looked for."""
+LOOKS: Final = 4
+"""How often a state is looked at until it must have been reached."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pauses:
+    """Pauses between the turns of a command, s."""
+
+    wake: float = 3.0
+    """Without a pilot signal: wakes a car (PROTOCOLS.md, 2)."""
+    setup: float = 0.5
+    """Between the writes of a set-up (PROTOCOLS.md, 2)."""
+    boot: float = 0.6
+    """Between two looks for a box that has been reset."""
+    retry: float = 0.4
+    """After a first request that a sleeping box has lost."""
+    verify: float = 0.3
+    """Between two looks at a state that is to be reached."""
+
+
+@dataclass(frozen=True, slots=True)
+class Debt:
+    """A state that a command brings about on its way, and what ends it."""
+
+    state: int
+    end: StateCode
+
+
+class Dialogue:
+    """Steps that several commands share."""
+
+    pauses: ClassVar = Pauses()
+
+    def __init__(self, charger: AblCharger) -> None:
+        """Take the charger, for its identity, its readings and its limit."""
+        self._charger = charger
+
+    async def _reach(self, talk: Talk) -> Turns:
+        """Wake the box itself: nothing has been written, so asking again is safe."""
+        for last in (False, False, True):
+            try:
+                await self._charger.identify(talk)
+                await self._charger.look(talk)
+            except ReplyTimeoutError:
+                if last:
+                    raise
+            else:
+                return
+            yield self.pauses.retry
+
+    def _state(self) -> Reading:
+        """Return the last reading."""
+        if self._charger.raw is None:
+            message = f"{self._charger.config.name} has told no state"
+            raise NotAvailableError(message)
+        return self._charger.raw
+
+    async def _say(self, talk: Talk, code: StateCode) -> bool:
+        """Write a state code, once; return whether it was confirmed."""
+        try:
+            await set_state(talk, self._charger.config.address, code)
+        except ReplyTimeoutError:
+            return False
+        return True
+
+    def _hold_polls(self, talk: Talk) -> None:
+        """Let no regular exchange come between: the box is off or moving."""
+        slot = self._charger.slot
+        slot.ready = max(slot.ready, talk.now + 2 * self.pauses.boot)
+
+    def _refuse_in(self, reading: Reading, what: str) -> NotAvailableError:
+        name = self._charger.config.name
+        state = state_of(reading.state).name
+        return NotAvailableError(f"{name} is in state {state}: {what}")
+
+    async def _reach_state(
+        self, talk: Talk, code: StateCode, reached: Callable[[Reading], bool]
+    ) -> Turns:
+        """Write a state code and see that it works; again only if it was lost."""
+        confirmed = await self._say(talk, code)
+        for _ in range(LOOKS):
+            if reached(await self._charger.look(talk)):
+                return
+            if not confirmed:
+                confirmed = await self._say(talk, code)
+            yield self.pauses.verify
+        if reached(await self._charger.look(talk)):
+            return
+        message = f"{self._charger.config.name} does not follow {code.name}"
+        raise NotConfirmedError(message)
+
+    async def _after_reset(self, talk: Talk, *, was_disabled: bool) -> Turns:
+        """Wait for a box to come back; then nothing may be open that was closed.
+
+        A reset ends in A1 with Idefault: neither the limit nor E0 has survived it.
+        """
+        charger = self._charger
+        charger.forget()
+        for look in range(BOOT_LOOKS):
+            self._hold_polls(talk)
+            yield self.pauses.boot
+            self._hold_polls(talk)
+            try:
+                await charger.identify(talk)
+                await charger.look(talk)
+                break
+            except ReplyTimeoutError:
+                if look == BOOT_LOOKS - 1:
+                    raise
+        if not is_within(self._state().duty, limit_duty(charger.setpoint)):
+            async for pause in charger.enforce(talk, lambda: charger.setpoint):
+                yield pause
+        if was_disabled and self._state().state != E0:
+            async for pause in self._reach_state(
+                talk, StateCode.E0, lambda now: now.state == E0
+            ):
+                yield pause
+
+    async def _give_back(self, talk: Talk) -> Turns:
+        """End the state that we brought about; a lost exchange is tried again."""
+        charger = self._charger
+        debt = charger.owes
+        for _ in range(LOOKS):
+            if debt is None:
+                return
+            with suppress(ExchangeError):
+                if (await charger.look(talk)).state == debt.state:
+                    await self._say(talk, debt.end)
+                    await charger.look(talk)
+                if self._state().state != debt.state:
+                    charger.owes = None
+                    return
+            yield self.pauses.verify
+        raise NotConfirmedError(f"{charger.config.name} does not leave its state")

@@ -1,0 +1,291 @@
+"""What is known of one ABL box, and how it is asked.
+
+Who answers is checked anew after each (re)connect and after each missed answer,
+before anything else is said. PROTOCOLS.md, 2.
+"""
+
+from dataclasses import dataclass
+from typing import Final, override
+
+from ..charger import Charger
+from ..exchange import Talk
+from ..framing import Timing
+from ..model import (
+    Capability,
+    ChargerConfig,
+    ExchangeRefusedError,
+    Fault,
+    GarbledReplyError,
+    Limits,
+    Orders,
+    Phases,
+    ReplyTimeoutError,
+    WrongChargerError,
+)
+from .exchanges import read
+from .readings import (
+    EnergyEstimate,
+    Told,
+    charger_info,
+    charger_reading,
+    phase_currents,
+    power_of,
+)
+from .registers import (
+    FLAGS,
+    ICMAX,
+    INFO,
+    LONGEST_REPLY,
+    LONGEST_REQUEST,
+    READING,
+    SERIAL,
+    Flags,
+    Info,
+    Reading,
+    decode_flags,
+    decode_icmax,
+    decode_info,
+    decode_reading,
+    decode_serial,
+)
+
+TIMING: Final = Timing(
+    # A box answers within some milliseconds; network adapters take longer.
+    reply_timeout=0.3,
+    longest_reply=LONGEST_REPLY,
+    # The first request after an idle time is lost; the repeat comes 0.7 s after it.
+    retry_pauses=(0.4, 1.0),
+)
+
+FLAGS_INTERVAL: Final = 30.0
+"""Time between two readings of the system flags, s."""
+FLAGS_MISSES: Final = 3
+"""Flags left unanswered in a row until the old ones no longer count."""
+
+_CAPABILITIES: Final = frozenset(
+    {
+        Capability.STATUS,
+        Capability.RAW_STATE,
+        Capability.PLUGGED,
+        Capability.CHARGING,
+        Capability.OFFERED_CURRENT,
+        Capability.FAULTS,
+        Capability.UPSTREAM_TIMEOUT,
+        Capability.ENABLE_AFTER_POWER_CYCLE,
+        Capability.OUTLET_ENABLED,
+        Capability.RESET,
+        Capability.WAKE,
+        Capability.SET_ADDRESS,
+    }
+)
+_WITH_METER: Final = frozenset(
+    {Capability.CURRENT, Capability.ESTIMATED_POWER, Capability.ESTIMATED_ENERGY}
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AblConfig(ChargerConfig):
+    """What the user set up for one ABL wallbox."""
+
+    phase_order: Phases[int] = (1, 2, 3)
+    """The phase that each of Ict1, Ict2, Ict3 measures; some boxes begin with L3."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for what is no order of three phases."""
+        if sorted(self.phase_order) != [1, 2, 3]:
+            message = f"{self.phase_order} is no order of the phases 1, 2, 3"
+            raise ValueError(message)
+
+
+class AblReader(Charger):
+    """One ABL wallbox, as far as it is asked and not told."""
+
+    timing = TIMING
+
+    def __init__(self, config: ChargerConfig, orders: Orders) -> None:
+        """Take the set-up; the box is not known before it answers."""
+        super().__init__(config, orders)
+        self.raw: Reading | None = None
+        """What 0x002E told last, undecided."""
+        self.tells_icmax: bool | None = None
+        """Whether it knows register 0x000F; ``None``: not asked yet."""
+        self._serial: str | None = None
+        self._info: Info | None = None
+        self._flags: Flags | None = None
+        self._icmax: int | None = None
+        self._identified = False
+        self._flags_due = 0.0
+        self._flags_missed = 0
+        self._energy = EnergyEstimate(config.poll_interval)
+
+    @property
+    @override
+    def capabilities(self) -> frozenset[Capability]:
+        known = _CAPABILITIES
+        if self._info is not None and self._info.meter:
+            known |= _WITH_METER
+        if self.config.order_lifetime is not None:
+            # The box has no such value; it counts when orders are not renewed.
+            known |= {Capability.FAIL_SAFE_CURRENT}
+        return known
+
+    @property
+    @override
+    def limits(self) -> Limits:
+        return Limits(installation=self.config.installation_limit)
+
+    @property
+    @override
+    def longest_request(self) -> int:
+        return LONGEST_REQUEST
+
+    @property
+    @override
+    def exchanges_per_turn(self) -> int:
+        # Identity (info, serial twice), reading, limit, reading twice.
+        return 7
+
+    # -- Who it is ---------------------------------------------------------------
+
+    @override
+    def on_line_open(self) -> None:
+        self.forget()
+
+    def forget(self) -> None:
+        """Ask anew who it is before anything else is said."""
+        self.raw = None
+        self._identified = False
+        self._flags = None
+        self._flags_due = 0.0
+        self._icmax = None
+        self.tells_icmax = None
+        self._energy.interrupt()
+
+    @override
+    def missed(self, now: float) -> None:
+        super().missed(now)
+        # Whoever answers next may be another one.
+        self._identified = False
+
+    @property
+    def serial(self) -> str | None:
+        """Return the serial number that was read at this address."""
+        return self._serial if self._identified else None
+
+    async def identify(self, talk: Talk) -> Info:
+        """Make sure that the right box answers; return what it is.
+
+        Raises WrongChargerError, and then nothing may be written.
+        """
+        if self._identified and self._info is not None:
+            return self._info
+        address = self.config.address
+        info = decode_info(await read(talk, address, INFO))
+        serial = await self._read_serial(talk)
+        expected = self.config.serial or self._serial
+        if expected is not None and serial != expected:
+            self.tell(Fault.WRONG_CHARGER, present=True)
+            self.set_unavailable()
+            found = serial or "no serial number"
+            message = f"at device-ID {address} answers {found}, not {expected}"
+            raise WrongChargerError(message, expected=expected, found=found)
+        self.tell(Fault.WRONG_CHARGER, present=False)
+        self._serial = serial
+        self._info = info
+        self._identified = True
+        self.info = charger_info(info, serial, self._flags)
+        return info
+
+    async def _read_serial(self, talk: Talk) -> str | None:
+        """Return the serial number; ``None`` from a box that tells none.
+
+        The manual shows 0x0050 in an example only. Where no serial number is
+        expected, silence is taken for a register that is not there.
+        """
+        try:
+            data = await read(talk, self.config.address, SERIAL, attempts=2)
+        except GarbledReplyError:
+            raise
+        except ReplyTimeoutError, ExchangeRefusedError:
+            if self.config.serial is not None or self._serial is not None:
+                raise
+            return None
+        return decode_serial(data)
+
+    # -- What it says ------------------------------------------------------------
+
+    async def look(self, talk: Talk) -> Reading:
+        """Read the state anew in the midst of a conversation, and keep it."""
+        raw = await self.read_once(talk, attempts=2)
+        self.take(raw, talk.now)
+        return raw
+
+    async def read_once(self, talk: Talk, *, attempts: int = 1) -> Reading:
+        """Return what 0x002E tells; raises what `Talk.exchange` raises."""
+        data = await read(talk, self.config.address, READING, attempts=attempts)
+        return decode_reading(data)
+
+    def take(self, raw: Reading, now: float) -> None:
+        """Make a reading of what was told."""
+        self.raw = raw
+        if self._info is None:
+            return
+        told = Told(reading=raw, info=self._info, flags=self._flags, icmax=self._icmax)
+        order = (
+            self.config.phase_order if isinstance(self.config, AblConfig) else (1, 2, 3)
+        )
+        currents = phase_currents(told, order)
+        power = power_of(currents, self.config.voltage)
+        self._energy.add(power, now)
+        energy = self._energy.energy if self._info.meter else None
+        reading = charger_reading(told, currents, power, energy)
+        changed = reading != self.reading
+        self.reading = reading
+        if changed:
+            self.updated()
+
+    async def read_flags_if_due(self, talk: Talk, raw: Reading) -> None:
+        """Read the flags from time to time, and when the state is another one."""
+        known = self.raw
+        if (
+            known is None
+            or (known.state, known.reduced) != (raw.state, raw.reduced)
+            or talk.now >= self._flags_due
+        ):
+            await self.read_flags(talk)
+
+    async def read_flags(self, talk: Talk) -> None:
+        """Read the flags; without an answer the old ones count for a while."""
+        try:
+            self._flags = decode_flags(await read(talk, self.config.address, FLAGS))
+            if self.tells_icmax:
+                data = await read(talk, self.config.address, ICMAX)
+                self._icmax = decode_icmax(data)
+        except ReplyTimeoutError, ExchangeRefusedError:
+            self._flags_missed += 1
+            if self._flags_missed >= FLAGS_MISSES:
+                self._flags = None
+                self._icmax = None
+                self._flags_due = talk.now + FLAGS_INTERVAL
+            return
+        self._flags_missed = 0
+        self._flags_due = talk.now + FLAGS_INTERVAL
+        if self._info is not None:
+            self.info = charger_info(self._info, self._serial, self._flags)
+
+    async def look_for_icmax(self, talk: Talk) -> None:
+        """Find out whether the box knows a register that the manual omits."""
+        # Silence is its answer for "no", and no miss.
+        self.tells_icmax = False
+        try:
+            data = await read(talk, self.config.address, ICMAX)
+        except ReplyTimeoutError, ExchangeRefusedError:
+            return
+        self.tells_icmax = True
+        self._icmax = decode_icmax(data)
+
+    def tell(self, fault: Fault, *, present: bool) -> None:
+        """Note a fault of our own finding, and tell the listeners of a change."""
+        if present != (fault in self.noticed):
+            self.notice(fault, present=present)
+            self.updated()

@@ -1,0 +1,167 @@
+"""Setting an ABL box up: device-ID and what it keeps through a power failure.
+
+Register 0x002C takes them in state E2, and they hold after a reset. The box must have
+been told from all others by its serial number before (PROTOCOLS.md, 2).
+"""
+
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
+
+from ..exchange import Talk
+from ..model import (
+    DuplicateAddressError,
+    EvseError,
+    NotAvailableError,
+    NotConfirmedError,
+    ReplyTimeoutError,
+)
+from ..turns import Turns
+from .dialogue import BOOT_LOOKS, Debt, Dialogue
+from .exchanges import configure, read
+from .registers import INFO, SERIAL, Reading, StateCode, decode_serial
+from .states import A1, E0, E2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """What is to be set in register 0x002C; ``None``: stays as it is."""
+
+    device_id: int | None = None
+    upstream_timeout: bool | None = None
+    needs_enable: bool | None = None
+
+
+class SetUp(Dialogue):
+    """The conversation that sets a box up."""
+
+    async def run(self, settings: Settings, talk: Talk) -> Turns:
+        """Set device-ID or settings: E2, 0x002C, reset; then see that it is so."""
+        charger = self._charger
+        async for pause in self._reach(talk):
+            yield pause
+        old = charger.config.address
+        new = old if settings.device_id is None else settings.device_id
+        if settings.device_id == old:
+            return
+        before = self._state()
+        serial = self._check_ready(before)
+        if new != old:
+            async for pause in self._make_sure_free(talk, new):
+                yield pause
+        back = StateCode.E0 if before.state == E0 else StateCode.A1
+        charger.owes = Debt(E2, back)
+        try:
+            async for pause in self._write(talk, settings, new):
+                yield pause
+        except EvseError:
+            # Out of the set-up mode again, whatever went wrong.
+            with suppress(EvseError):
+                async for pause in self._give_back(talk):
+                    yield pause
+            raise
+        charger.forget()
+        async for pause in self._move(talk, new, serial):
+            yield pause
+        async for pause in self._after_reset(talk, was_disabled=before.state == E0):
+            yield pause
+        charger.owes = None
+        await charger.read_flags(talk)
+        self._check_settings(settings)
+
+    def _check_ready(self, reading: Reading) -> str:
+        """Return the serial number of a box that can be set up now.
+
+        Raises NotAvailableError.
+        """
+        if reading.state not in (A1, E0):
+            raise self._refuse_in(reading, "only in A1 and E0 can it be set up")
+        if (serial := self._charger.serial) is None:
+            message = (
+                f"{self._charger.config.name} tells no serial number: it cannot be "
+                "told from another box with the same device-ID"
+            )
+            raise NotAvailableError(message)
+        return serial
+
+    async def _make_sure_free(self, talk: Talk, address: int) -> Turns:
+        """Raise DuplicateAddressError when somebody has that address already."""
+        bus = self._charger.bus
+        others = bus.chargers.values() if bus is not None else ()
+        taken = any(other.config.address == address for other in others)
+        for ask in range(2):
+            if taken:
+                break
+            with suppress(ReplyTimeoutError):
+                await read(talk, address, INFO)
+                taken = True
+            if not ask:
+                # A box asleep loses the first request.
+                yield self.pauses.retry
+        if taken:
+            message = f"device-ID {address} is taken already"
+            raise DuplicateAddressError(message)
+
+    async def _write(self, talk: Talk, settings: Settings, new: int) -> Turns:
+        self._hold_polls(talk)
+        async for pause in self._reach_state(
+            talk, StateCode.E2, lambda now: now.state == E2
+        ):
+            yield pause
+        self._hold_polls(talk)
+        yield self.pauses.setup
+        self._hold_polls(talk)
+        write = partial(
+            configure,
+            talk,
+            self._charger.config.address,
+            new,
+            upstream_timeout=settings.upstream_timeout,
+            needs_enable=settings.needs_enable,
+        )
+        try:
+            await write()
+        except ReplyTimeoutError:
+            # It cannot be read before the reset; the same value twice is the same.
+            await write()
+        yield self.pauses.setup
+        self._hold_polls(talk)
+        if not await self._say(talk, StateCode.RESET):
+            with suppress(ReplyTimeoutError):
+                if (await self._charger.look(talk)).state == E2:
+                    await self._say(talk, StateCode.RESET)
+
+    async def _move(self, talk: Talk, new: int, serial: str) -> Turns:
+        """Find the box at its new address, by its serial number; then go there."""
+        charger = self._charger
+        if new == charger.config.address:
+            return
+        for _ in range(BOOT_LOOKS):
+            self._hold_polls(talk)
+            yield self.pauses.boot
+            self._hold_polls(talk)
+            with suppress(ReplyTimeoutError):
+                found = decode_serial(await read(talk, new, SERIAL))
+                if found == serial:
+                    charger.config = replace(charger.config, address=new)
+                    return
+        message = (
+            f"{charger.config.name} was not found at device-ID {new}; "
+            f"it is still expected at {charger.config.address}"
+        )
+        raise NotConfirmedError(message)
+
+    def _check_settings(self, settings: Settings) -> None:
+        """Raise NotConfirmedError when a setting is not as it was set."""
+        charger = self._charger
+        options = charger.info.options if charger.info is not None else {}
+        wanted = {
+            "upstream_timeout": settings.upstream_timeout,
+            "enable_after_power_cycle": (
+                None if settings.needs_enable is None else not settings.needs_enable
+            ),
+        }
+        for name, value in wanted.items():
+            if value is not None and options.get(name) is not value:
+                message = f"{charger.config.name} did not take {name} = {value}"
+                raise NotConfirmedError(message)
