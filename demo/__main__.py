@@ -30,8 +30,8 @@ def main() -> int:
     """Run until a signal, or until something ends that should not."""
     try:
         settings = from_environment()
-        with _alone(settings):
-            _check_port(settings)
+        with alone(settings):
+            check_port(settings)
             prepare(settings)
             asyncio.run(_until_signal(settings))
     except DemoError as error:
@@ -44,7 +44,7 @@ def main() -> int:
 
 
 @contextmanager
-def _alone(settings: Settings) -> Iterator[None]:
+def alone(settings: Settings) -> Iterator[None]:
     """Keep a second demo out of the same folder."""
     settings.folder.mkdir(parents=True, exist_ok=True)
     with (settings.folder / "lock").open("w") as lock:
@@ -63,7 +63,8 @@ def _alone(settings: Settings) -> Iterator[None]:
         yield
 
 
-def _check_port(settings: Settings) -> None:
+def check_port(settings: Settings) -> None:
+    """Raise DemoError when Home Assistant could not listen there."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator, Callable, Iterator
 import json
 import os
 from pathlib import Path
+import socket
 import sys
 
 from homeassistant.auth import auth_manager_from_config
@@ -20,6 +21,7 @@ import pytest
 from pytest_homeassistant_custom_component.typing import ClientSessionGenerator
 
 from demo import home, processes
+from demo.__main__ import alone, check_port
 from demo.buses import BUSES
 from demo.client import Client
 from demo.dashboard import dashboard
@@ -80,7 +82,11 @@ async def test_buses_are_added_once_and_all_is_on_the_dashboard(
         assert [point.limits_in_force for point in points] == [(32.0,) * 3] * 2
         assert [round(box.ic_amps) for box in boxes] == [16, 10, 13]
 
+        mine = {"entity_id": "number.garage_charging_current", "value": 9}
+        await client.post("services/number/set_value", mine)
+
         await home.furnish(client, settings)
+        assert round(boxes[0].ic_amps) == 9
         entries = hass.config_entries.async_entries(DOMAIN)
         assert len(entries) == len(BUSES)
         assert not hass.config_entries.flow.async_progress()
@@ -229,6 +235,37 @@ def _alive(pid: int) -> bool:
         return "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text()
     except OSError:
         return False
+
+
+# -- What can be in the way ------------------------------------------------------
+
+
+def test_one_demo_in_one_folder(tmp_path: Path) -> None:
+    settings = _settings(tmp_path / "state")
+    with (
+        alone(settings),
+        pytest.raises(DemoError, match="runs already"),
+        alone(settings),
+    ):
+        pytest.fail("two demos share a folder")
+    with alone(settings):
+        pass
+    # The ports that Home Assistant has stored would not be there.
+    settings.folder.rename(tmp_path / "moved")
+    with (
+        pytest.raises(DemoError, match="made in another place"),
+        alone(_settings(tmp_path / "moved")),
+    ):
+        pytest.fail("a moved folder is used")
+
+
+@pytest.mark.usefixtures("socket_enabled")
+def test_a_taken_port_is_told(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        settings = Settings(folder=tmp_path, port=server.getsockname()[1])
+        with pytest.raises(DemoError, match="is taken by another program"):
+            check_port(settings)
+    check_port(settings)
 
 
 # -- Pure parts ------------------------------------------------------------------
