@@ -160,6 +160,8 @@ async def test_own_name_of_a_bus_is_kept(hass: HomeAssistant) -> None:
         flow = await Flow.change_bus(hass, entry)
         await flow.submit({"device": bus.url, "line": {}})
         assert flow.result["reason"] == "reconfigure_successful"
+        # The reload opens the port, so the bus must still be there.
+        await hass.async_block_till_done()
     assert entry.title == "Car park"
 
 
