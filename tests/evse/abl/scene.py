@@ -12,7 +12,7 @@ from typing import Self
 from custom_components.evse_bus.evse.abl import PROTOCOL, AblCharger, AblConfig
 from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.model import CurrentLimit, Orders
-from tests.virtual import AblBox, Request, VirtualBus, requests_in
+from tests.virtual import AblBox, Car, Request, VirtualBus, requests_in
 
 LIMIT = 0x14
 STATE = 0x05
@@ -152,3 +152,25 @@ class Scene:
             for one in self.requests()
             if one.value is not None and register in (None, one.register)
         ]
+
+
+def sleepy() -> Car:
+    """Return a car that is plugged in, may charge, and takes nothing."""
+    car = Car(ramp=0.1, reaction=0.0)
+    car.plug_in(request=False)
+    return car
+
+
+def box_with(car: Car | None = None, **settings: object) -> AblBox:
+    return AblBox(1, car=car, boot_time=0.05, **settings)  # type: ignore[arg-type]
+
+
+def answers(box: AblBox, *fates: str | bytes) -> None:
+    """Say what becomes of the next answers: good, lose, or other bytes instead."""
+    for fate in fates:
+        if fate == "good":
+            box.faults.once("noise", b"")
+        elif isinstance(fate, bytes):
+            box.faults.once("replace", fate)
+        else:
+            box.faults.once("lose")

@@ -7,7 +7,6 @@ import pytest
 from custom_components.evse_bus.evse.abl.dialogue import Dialogue, Pauses
 from custom_components.evse_bus.evse.model import (
     Command,
-    DuplicateAddressError,
     EvseError,
     Fault,
     NotAvailableError,
@@ -16,45 +15,23 @@ from custom_components.evse_bus.evse.model import (
     RefusedOrderError,
     ReplyTimeoutError,
 )
-from tests.virtual import AblBox, Car, Request
+from tests.virtual import Car, Request
 
-from .scene import LIMIT, SETUP, STATE, Scene, config, orders, until
+from .scene import (
+    STATE,
+    Scene,
+    answers,
+    box_with,
+    config,
+    orders,
+    sleepy,
+    until,
+)
 
 RESET, A1, E0, E2 = 0x5A5A, 0xA1A1, 0xE0E0, 0xE2E2
 PAUSE = 1000
 
-
-REAL = Dialogue.pauses
-SHORT = Pauses(wake=0.3, setup=0.03, boot=0.08, retry=0.2, verify=0.05)
-
-
-@pytest.fixture(autouse=True)
-def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the virtual car wake, and the virtual box start, sooner than real ones."""
-    monkeypatch.setattr(Dialogue, "pauses", SHORT)
-
-
-def sleepy() -> Car:
-    """Return a car that is plugged in, may charge, and takes nothing."""
-    car = Car(ramp=0.1, reaction=0.0)
-    car.plug_in(request=False)
-    return car
-
-
-def box_with(car: Car | None = None, **settings: object) -> AblBox:
-    return AblBox(1, car=car, boot_time=0.05, **settings)  # type: ignore[arg-type]
-
-
-def answers(box: AblBox, *fates: str | bytes) -> None:
-    """Say what becomes of the next answers: good, lose, or other bytes instead."""
-    for fate in fates:
-        if fate == "good":
-            box.faults.once("noise", b"")
-        elif isinstance(fate, bytes):
-            box.faults.once("replace", fate)
-        else:
-            box.faults.once("lose")
-
+pytestmark = pytest.mark.usefixtures("short_pauses")
 
 # -- Outlet ----------------------------------------------------------------------------
 
@@ -155,7 +132,7 @@ async def test_an_outlet_is_on_or_off(value: object) -> None:
 
 
 async def test_a_car_is_woken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Dialogue, "pauses", REAL)
+    monkeypatch.setattr(Dialogue, "pauses", Pauses())
     box = box_with(sleepy())
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders())
@@ -324,144 +301,3 @@ async def test_a_command_for_a_dead_box() -> None:
         with pytest.raises((ReplyTimeoutError, NotConfirmedError)):
             await charger.command(Command.RESET)
         assert scene.writes() == []
-
-
-# -- Set-up ------------------------------------------------------------------------------
-
-
-async def test_a_new_device_id() -> None:
-    box = box_with()
-    async with Scene(box) as scene:
-        charger = await scene.settled(config(), orders(10))
-        await charger.command(Command.SET_ADDRESS, 7)
-        assert box.device_id == 7
-        assert charger.config.address == 7
-        assert scene.writes(STATE) == [E2, RESET]
-        # Bits 15..12: no change.
-        assert scene.writes(SETUP) == [0xF007]
-        assert box.outlet.upstream_enabled is False
-        await until(lambda: charger.available and box.ic_amps < 10)
-        assert scene.reads(7, 0x50)
-
-
-async def test_a_new_device_id_in_e0_leaves_the_outlet_disabled() -> None:
-    box = box_with()
-    async with Scene(box) as scene:
-        charger = await scene.settled(config(), orders())
-        await charger.command(Command.SET_OUTLET, value=False)
-        await charger.command(Command.SET_ADDRESS, 2)
-        assert (box.device_id, box.state) == (2, "E0")
-
-
-async def test_a_device_id_that_is_taken() -> None:
-    stranger = AblBox(3, serial="2W22xy00000003", sleep_after=5, wake_time=0.1)
-    async with Scene(box_with(), AblBox(2, serial="2W22xy00000002"), stranger) as scene:
-        charger = await scene.settled(config(), orders())
-        scene.add(config(2), orders())
-        for address in (2, 3):
-            with pytest.raises(DuplicateAddressError, match=str(address)):
-                await charger.command(Command.SET_ADDRESS, address)
-        assert scene.writes() == []
-        assert charger.config.address == 1
-
-
-@pytest.mark.parametrize("value", [0, 17, True, None, 2.0])
-async def test_no_device_id(value: object) -> None:
-    async with Scene(box_with()) as scene:
-        charger = await scene.settled(config(), orders())
-        with pytest.raises(RefusedOrderError):
-            await charger.command(Command.SET_ADDRESS, value=value)  # type: ignore[arg-type]
-        await charger.command(Command.SET_ADDRESS, 1)
-        assert scene.writes() == []
-
-
-async def test_no_set_up_with_a_car_or_without_a_serial_number() -> None:
-    car = sleepy()
-    box = box_with(car)
-    async with Scene(box) as scene:
-        charger = await scene.settled(config(), orders())
-        await until(lambda: box.state == "B2")
-        with pytest.raises(NotAvailableError, match="B2"):
-            await charger.command(Command.SET_ADDRESS, 2)
-        assert scene.writes() == []
-    box = box_with(serial="")
-    async with Scene(box) as scene:
-        charger = await scene.settled(config(), orders())
-        with pytest.raises(NotAvailableError, match="serial number"):
-            await charger.command(Command.SET_ADDRESS, 2)
-        assert scene.writes() == []
-
-
-async def test_a_refused_set_up_leaves_the_set_up_mode() -> None:
-    box = box_with()
-    async with Scene(box) as scene:
-        charger = await scene.settled(config(), orders())
-        await scene.quiet(charger)
-        # The look before, E2, the state, and the set-up.
-        answers(box, "good", "good", "good", b">0190046B\r\n")
-        with pytest.raises(EvseError, match="exception 4"):
-            await charger.command(Command.SET_UPSTREAM_TIMEOUT, value=True)
-        assert scene.writes() == [E2, 0xB001, A1]
-        assert box.state == "A1"
-
-
-@pytest.mark.parametrize("on", [True, False])
-async def test_upstream_timeout(on: bool) -> None:  # noqa: FBT001
-    box = box_with(upstream_enabled=not on)
-    async with Scene(box) as scene:
-        charger = await scene.settled(config(), orders())
-        await charger.command(Command.SET_UPSTREAM_TIMEOUT, value=on)
-        assert box.outlet.upstream_enabled is on
-        assert scene.writes(SETUP) == [0xB001 if on else 0x7001]
-        assert charger.info is not None
-        assert charger.info.options["upstream_timeout"] is on
-
-
-@pytest.mark.parametrize("on", [True, False])
-async def test_enable_after_power_cycle(on: bool) -> None:  # noqa: FBT001
-    box = box_with()
-    box.outlet.b2_needs_enable_after_power = on
-    async with Scene(box) as scene:
-        charger = await scene.settled(config(), orders())
-        await charger.command(Command.SET_ENABLE_AFTER_POWER_CYCLE, value=on)
-        assert box.outlet.b2_needs_enable_after_power is not on
-        assert scene.writes(SETUP) == [0xD001 if on else 0xE001]
-        assert charger.info is not None
-        assert charger.info.options["enable_after_power_cycle"] is on
-
-
-async def test_a_setting_that_does_not_last() -> None:
-    box = box_with()
-    async with Scene(box) as scene:
-        charger = await scene.settled(config(), orders())
-        # Somebody else's set-up goes into the box in place of ours.
-        box._configure = lambda _value: True  # type: ignore[method-assign]
-        with pytest.raises(NotConfirmedError, match="upstream_timeout"):
-            await charger.command(Command.SET_UPSTREAM_TIMEOUT, value=True)
-        assert box.state == "A1"
-
-
-async def test_nothing_is_ever_said_to_all() -> None:
-    box = box_with()
-    async with Scene(box) as scene:
-        charger = await scene.settled(config(), orders())
-        await charger.command(Command.SET_ADDRESS, 5)
-        await charger.command(Command.RESET)
-        await charger.change_orders(OrderChange(current=8))
-        assert {one.device_id for one in scene.requests()} <= {1, 5}
-        assert scene.writes(LIMIT) == [133]
-
-
-async def test_a_port_lost_in_the_set_up_mode() -> None:
-    box = box_with()
-    async with Scene(box) as scene:
-        charger = await scene.settled(config(), orders())
-        setting = asyncio.create_task(charger.command(Command.SET_ADDRESS, 2))
-        await until(lambda: box.state == "E2")
-        scene.virtual.unplug()
-        with pytest.raises(EvseError):
-            await setting
-        scene.virtual.replug()
-        await until(lambda: box.state == "A1")
-        await until(lambda: charger.owes is None)
-        assert charger.config.address == box.device_id
