@@ -52,7 +52,7 @@ def watch() -> Iterator[Blocks]:
             else:
                 heapq.heapreplace(blocks.longest, entry)
 
-    Handle._run = timed  # type: ignore[method-assign] # noqa: SLF001
+    Handle._run = timed  # type: ignore[method-assign, assignment] # noqa: SLF001
     try:
         yield blocks
     finally:
