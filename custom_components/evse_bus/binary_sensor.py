@@ -13,7 +13,7 @@ from homeassistant.const import EntityCategory, Platform
 from homeassistant.core import HomeAssistant
 from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
 
-from .coordinator import BusCoordinator, ChargerUnit, EvseBusConfigEntry
+from .coordinator import BusCoordinator, EvseBusConfigEntry
 from .entity import (
     BusEntity,
     ChargerEntity,
@@ -22,6 +22,7 @@ from .entity import (
     supported,
 )
 from .evse.model import Capability, ConnectorReading
+from .unit import ChargerUnit
 
 PARALLEL_UPDATES = 0
 

@@ -20,8 +20,7 @@ from homeassistant.helpers.update_coordinator import BaseDataUpdateCoordinatorPr
 
 from .const import CONF_SERIAL, LOGGER, SUBENTRY_CHARGER
 from .devices import BusDevices, connector_key
-from .evse.charger import Charger
-from .evse.model import ChargerConfig, ConnectorReading, Orders
+from .evse.model import ChargerConfig, Orders
 from .issues import BusIssues
 from .orders import OrderStore
 from .setup import (
@@ -31,6 +30,7 @@ from .setup import (
     line_settings,
     protocol_of,
 )
+from .unit import ChargerUnit
 
 _IN_PLACE: Final = (
     "name",
@@ -49,41 +49,6 @@ BUS: Final[Context] = ("bus", None)
 STATISTICS: Final[Context] = ("statistics", None)
 STATISTICS_INTERVAL: Final = timedelta(seconds=30)
 """Counters change with every exchange; they are told this often."""
-
-
-class ChargerUnit:
-    """One charger and what the integration knows about it."""
-
-    def __init__(self, subentry: ConfigSubentry, charger: Charger) -> None:
-        """Start with nothing shown."""
-        self.subentry_id = subentry.subentry_id
-        self.subentry = subentry
-        self.charger = charger
-        """The library's charger; another one after the set-up was changed."""
-        self.device_id = ""
-        self.split = False
-        """Its connectors are devices of their own."""
-        self.added: set[tuple[str, str]] = set()
-        """Platform and unique id of the entities that exist."""
-        self.connectors: dict[int, ConnectorReading] = {}
-        """As last told to listeners; empty: the charger is not available."""
-        self.numbers: set[int] = set()
-        """Connectors seen since the start."""
-        self.shape: object = None
-        """Capabilities and connectors that entities have been made for."""
-        self.unsubscribe: CALLBACK_TYPE = lambda: None
-
-    @property
-    def name(self) -> str:
-        """Return what the user calls it."""
-        return self.charger.config.name
-
-    def connector(self, number: int) -> ConnectorReading | None:
-        """Return what is known of a connector now."""
-        reading = self.charger.reading
-        if reading is None or not self.charger.available:
-            return None
-        return reading.connectors.get(number)
 
 
 class BusCoordinator(BaseDataUpdateCoordinatorProtocol):

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from homeassistant.config_entries import ConfigEntry
     from homeassistant.core import HomeAssistant
 
-    from .coordinator import ChargerUnit
+    from .unit import ChargerUnit
 
 
 class BusDevices:

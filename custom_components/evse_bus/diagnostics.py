@@ -13,7 +13,8 @@ from homeassistant.core import HomeAssistant
 from homeassistant.helpers.device_registry import ChildDeviceEntry, DeviceEntry
 
 from .const import CONF_SERIAL, DOMAIN
-from .coordinator import BusCoordinator, ChargerUnit, EvseBusConfigEntry
+from .coordinator import BusCoordinator, EvseBusConfigEntry
+from .unit import ChargerUnit
 
 # An adapter's path and a network address name the house as a serial number does.
 # An EVBox is addressed by its serial number.

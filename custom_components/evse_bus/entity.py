@@ -17,11 +17,11 @@ from .const import DOMAIN
 from .coordinator import (
     BUS,
     BusCoordinator,
-    ChargerUnit,
     Context,
     EvseBusConfigEntry,
 )
 from .devices import charger_info, connector_info, connector_key
+from .unit import ChargerUnit
 
 if TYPE_CHECKING:
     from homeassistant.helpers.entity import Entity, EntityDescription

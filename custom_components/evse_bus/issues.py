@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from homeassistant.config_entries import ConfigEntry
     from homeassistant.core import HomeAssistant
 
-    from .coordinator import ChargerUnit
+    from .unit import ChargerUnit
 
 NOT_STORED: Final = "orders_not_stored"
 LOST: Final = "orders_lost"

@@ -24,12 +24,13 @@ from homeassistant.const import (
 from homeassistant.core import HomeAssistant
 from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
 
-from .coordinator import BusCoordinator, ChargerUnit, EvseBusConfigEntry
+from .coordinator import BusCoordinator, EvseBusConfigEntry
 from .entity import ChargerEntity, add_charger_entities
 from .errors import translated_errors
 from .evse.charger import Charger
 from .evse.model import Capability, CurrentLimit, Limits, OrderChange, Orders, Phases
 from .evse.safety import number
+from .unit import ChargerUnit
 
 PARALLEL_UPDATES = 0
 

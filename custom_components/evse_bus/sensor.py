@@ -18,7 +18,6 @@ from homeassistant.util import dt as dt_util
 from .coordinator import (
     STATISTICS,
     BusCoordinator,
-    ChargerUnit,
     Context,
     EvseBusConfigEntry,
 )
@@ -45,6 +44,7 @@ from .sensor_tables import (
     ChargerSensorDescription,
     ConnectorSensorDescription,
 )
+from .unit import ChargerUnit
 
 PARALLEL_UPDATES = 0
 

@@ -9,11 +9,12 @@ from homeassistant.const import EntityCategory, Platform
 from homeassistant.core import HomeAssistant
 from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
 
-from .coordinator import BusCoordinator, ChargerUnit, EvseBusConfigEntry
+from .coordinator import BusCoordinator, EvseBusConfigEntry
 from .entity import ChargerEntity, add_charger_entities, supported
 from .errors import translated_errors
 from .evse.charger import Charger
 from .evse.model import Capability, Command, OrderChange
+from .unit import ChargerUnit
 
 PARALLEL_UPDATES = 0
 
