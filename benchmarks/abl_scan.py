@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Sequence
 from statistics import fmean, median
 
-from custom_components.evse_bus.evse.abl.charger import TIMING
+from custom_components.evse_bus.evse.abl import PROTOCOL
 
 from .figures import Figure, gaps, percentile
 from .progress import say
@@ -24,6 +24,8 @@ IDS = range(1, 17)
 DEAD = range(2, 17)
 WIRE_TIME = 13.75e-3
 TURN_ROUND = 2e-3
+REPLY_TIMEOUT = PROTOCOL.timing.reply_timeout
+REQUEST = 17 * PROTOCOL.settings.byte_time
 IDEAL = len(IDS) * (WIRE_TIME + TURN_ROUND)
 
 
@@ -57,11 +59,11 @@ async def run(*, quick: bool) -> list[Figure]:
         _figure("1 living, 15 dead: longest period", max(living) * 1000, "ms"),
         _figure(
             "longest, longer than alone by",
-            grown / (TIMING.reply_timeout + 17 * 11 / 38400),
+            grown / (REPLY_TIMEOUT + REQUEST),
             "exchanges that time out",
             digits=2,
             aim=1.05,
-            note=f"{grown * 1000:.0f} ms; time-out {TIMING.reply_timeout * 1000:.0f} ms"
+            note=f"{grown * 1000:.0f} ms; time-out {REPLY_TIMEOUT * 1000:.0f} ms"
             " + 4.9 ms request",
         ),
         _figure(
