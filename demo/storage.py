@@ -44,7 +44,6 @@ def prepare(settings: Settings) -> None:
     """Write what is missing or has changed; keep everything else."""
     config = settings.config
     (config / "custom_components").mkdir(parents=True, exist_ok=True)
-    settings.folder.chmod(0o700)
     _link(
         config / "custom_components" / "evse_bus",
         ROOT / "custom_components" / "evse_bus",
@@ -102,8 +101,11 @@ async def _write(settings: Settings) -> None:
         await hass.async_stop(force=True)
     if token is not None:
         # Last: only with a token everything before it is complete.
-        settings.token.touch(mode=0o600)
-        settings.token.write_text(token + "\n", encoding="utf-8")
+        new = settings.token.with_suffix(".new")
+        new.unlink(missing_ok=True)
+        new.touch(mode=0o600)
+        new.write_text(token + "\n", encoding="utf-8")
+        new.replace(settings.token)
 
 
 async def _write_http(hass: Any, port: int) -> None:  # noqa: ANN401 - see _write
