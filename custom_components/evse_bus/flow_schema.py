@@ -35,7 +35,7 @@ from .const import (
 )
 from .evse.model import MAXIMUM_CURRENT, MINIMUM_CURRENT, RefusedOrderError
 from .evse.protocols import PROTOCOLS
-from .evse.safety import MAXIMUM_TIMEOUT, number
+from .evse.safety import INTERVALS_PER_TIMEOUT, MAXIMUM_TIMEOUT, number
 from .flow_address import ADDRESSES, Errors
 
 if TYPE_CHECKING:
@@ -52,8 +52,6 @@ CONF_SEARCH_CURRENT: Final = "search_current"
 SUGGESTED_LIMIT: Final = 16.0
 """Offered, never taken unseen: the user confirms what the wiring may carry, A."""
 DEFAULT_FAIL_SAFE_TIMEOUT: Final = 60
-INTERVALS_PER_TIMEOUT: Final = 3
-"""A time-out must outlast this many polls, or one lost answer sets it off."""
 
 COMMANDS: Final = ("68", "69")
 """EVBox messages; 69 has no serial number, so every box feels spoken to."""

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Final
 from homeassistant.helpers import issue_registry as ir
 
 from .const import DOMAIN
-from .evse.evbox.timing import INTERVALS_PER_TIMEOUT
 from .evse.model import Fault, Orders
+from .evse.safety import INTERVALS_PER_TIMEOUT
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -84,9 +84,9 @@ class BusIssues:
         """Note a fail-safe time-out that is longer than ordered."""
         charger = unit.charger
         reading = charger.reading
-        told = reading.details.get("minimum_interval") if reading else None
+        told = reading.minimum_interval if reading else None
         # The interval that counts before one is told is a guess: no news.
-        if not isinstance(told, (int, float)):
+        if told is None:
             return
         ordered = charger.effective_orders.fail_safe_timeout
         if ordered >= INTERVALS_PER_TIMEOUT * told:

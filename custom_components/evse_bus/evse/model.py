@@ -286,6 +286,8 @@ class ChargerReading:
     """Current offered to the car now, A; 0: charging is paused."""
     maximum_current: float | None = None
     """Maximum of the connection or the box, A."""
+    minimum_interval: float | None = None
+    """The charger does not want to be asked more often than this, s."""
     outlet_enabled: bool | None = None
     faults: frozenset[Fault] = frozenset()
     fault_codes: tuple[str, ...] = ()

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 MAXIMUM_TIMEOUT = 0xFFFF
 """Longest fail-safe time-out a protocol can say, s (EVBox: one word)."""
+INTERVALS_PER_TIMEOUT = 3
+"""A time-out is at least this many intervals: two requests in a row may get lost."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

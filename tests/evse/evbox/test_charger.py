@@ -112,7 +112,6 @@ def test_from_the_first_message_to_the_reading() -> None:
             assert reading.details == {
                 "command": 68,
                 "modules": 2,
-                "minimum_interval": 1,
                 "told_maximum_current": 35.0,
                 "ordered_timeout": 60,
                 "effective_timeout": 60,

@@ -36,7 +36,7 @@ from ..model import (
     Orders,
     WrongChargerError,
 )
-from ..safety import Setpoint
+from ..safety import INTERVALS_PER_TIMEOUT, Setpoint
 from ..schedule import Kind
 from .config import EvboxConfig
 from .frames import LONGEST_REQUEST, EvboxFrame, Reply, decode_reply
@@ -44,7 +44,7 @@ from .over_limit import LimitWatch
 from .plausibility import Plausibility, Taken, used_currents
 from .reading import charger_info, connectors, same_serial, serial_number
 from .request import effective_timeout, encode, wire_setpoint
-from .timing import FOLLOW_TIME, INTERVAL_MARGIN, INTERVALS_PER_TIMEOUT, TIMING
+from .timing import FOLLOW_TIME, INTERVAL_MARGIN, TIMING
 
 if TYPE_CHECKING:
     from ..exchange import Talk
@@ -287,6 +287,7 @@ class EvboxCharger(Charger):
         self.reading = ChargerReading(
             connectors=connectors(taken, self.config.voltage),
             maximum_current=maximum.value if maximum.sure else None,
+            minimum_interval=taken.reply.minimum_interval,
             details=self._details(taken),
         )
 
@@ -295,7 +296,6 @@ class EvboxCharger(Charger):
         return {
             "command": self._evbox.command,
             "modules": len(taken.reply.modules),
-            "minimum_interval": taken.reply.minimum_interval,
             "told_maximum_current": taken.reply.maximum_current,
             "ordered_timeout": self.effective_orders.fail_safe_timeout,
             "effective_timeout": self.effective_timeout,

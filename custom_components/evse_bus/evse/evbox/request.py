@@ -4,10 +4,10 @@ from dataclasses import replace
 from math import ceil
 
 from ..model import Limits, Orders
-from ..safety import MAXIMUM_TIMEOUT, Setpoint, clamp, number
+from ..safety import INTERVALS_PER_TIMEOUT, MAXIMUM_TIMEOUT, Setpoint, clamp, number
 from .config import EvboxConfig
 from .frames import encode_68, encode_69
-from .timing import INTERVALS_PER_TIMEOUT, SHORTEST_INTERVAL
+from .timing import SHORTEST_INTERVAL
 
 
 def effective_timeout(asked: int, interval: float) -> int:

@@ -33,7 +33,5 @@ SHORTEST_INTERVAL: Final = 1
 """Taken where a box tells 0, s: even the shortest round costs 0.25 s."""
 INTERVAL_MARGIN: Final = 0.1
 """Added to the minimum interval, s: two clocks and a USB adapter are not exact."""
-INTERVALS_PER_TIMEOUT: Final = 3
-"""A time-out is at least this many intervals: two requests in a row may get lost."""
 FOLLOW_TIME: Final = 10.0
 """Time a car may take to accept a new current, s (manual, note **)."""
