@@ -519,6 +519,29 @@ def test_chargers_come_and_go_without_disturbing_the_others() -> None:
     simulate(scene())
 
 
+def test_a_charger_that_leaves_ends_what_it_has_begun() -> None:
+    async def scene() -> None:
+        async with Scene(addresses=(1, 2), interval=1.0) as bus:
+            await asyncio.sleep(1)
+            charger = bus.charger(1)
+
+            async def second(talk: Talk) -> int:
+                return await charger.say(talk, "B")
+
+            async def first(talk: Talk) -> Later[int]:
+                await charger.say(talk, "A")
+                return Later(3.0, second)
+
+            waiting = asyncio.create_task(charger.run(first))
+            await asyncio.sleep(0.5)
+            await bus.bus.remove(charger)
+            assert await waiting == 0
+            assert len(bus.line.times(1, "B")) == 1
+            assert "1" not in bus.bus.chargers
+
+    simulate(scene())
+
+
 def test_a_mistake_in_one_charger_does_not_end_the_bus() -> None:
     async def scene() -> None:
         async with Scene(addresses=(1, 2), interval=1.0) as bus:

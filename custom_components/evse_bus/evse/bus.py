@@ -108,16 +108,33 @@ class Bus:
         self._look_again()
 
     async def remove(self, charger: Charger) -> None:
-        """Take a charger off once its turn is over."""
-        while self._turn_of is not None and _belongs(self._turn_of, charger):
-            self._turn_over.clear()
-            await self._turn_over.wait()
+        """Take a charger off; what it has begun (waking a car) is finished first."""
+        self._drop_jobs(charger, begun=False)
+        with suppress(TimeoutError):
+            async with asyncio.timeout(STOP_PATIENCE):
+                while self._is_busy_with(charger):
+                    self._turn_over.clear()
+                    await self._turn_over.wait()
         self.chargers.pop(charger.config.key, None)
-        for job in self._jobs:
-            if job.charger is charger:
-                gone = NotAvailableError(f"{charger.config.name} was removed")
-                self._jobs.fail(job, gone)
+        self._drop_jobs(charger, begun=True)
         charger.bus = None
+
+    def _is_busy_with(self, charger: Charger) -> bool:
+        if self._turn_of is not None and _belongs(self._turn_of, charger):
+            return True
+        return self.connected and any(
+            job.begun for job in self._jobs if job.charger is charger
+        )
+
+    def _drop_jobs(self, charger: Charger, *, begun: bool) -> None:
+        gone = NotAvailableError(f"{charger.config.name} was removed")
+        for job in self._jobs:
+            if (
+                job.charger is charger
+                and not job.under_way
+                and (begun or not job.begun)
+            ):
+                self._jobs.fail(job, gone)
 
     def subscribe(self, listener: Callable[[], None]) -> Callable[[], None]:
         """Call back when the port is lost or back; return how to stop."""
