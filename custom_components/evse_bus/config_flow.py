@@ -51,7 +51,7 @@ from .flow_steps import ChargerSteps
 from .setup import line_settings, protocol_of
 from .subentry_flow import ChargerSubentryFlow
 
-_URL_EXAMPLES: Final = "`socket://192.0.2.5:4001` or `rfc2217://192.0.2.5:2217`"
+_URL_EXAMPLES: Final = "`socket://192.0.2.5:4001`, `rfc2217://192.0.2.5:2217`"
 """Not for translators: what is typed is the same everywhere."""
 
 
