@@ -3,6 +3,8 @@
 import argparse
 import asyncio
 import json
+import sys
+import traceback
 from typing import Final
 
 from . import abl_scan, evbox_bus, exchange_cpu, home_assistant, set_value
@@ -16,17 +18,22 @@ BENCHMARKS: Final = {
 }
 
 
-def main() -> None:
-    """Run the benchmarks that the command line names, or all."""
+def main() -> int:
+    """Run the benchmarks that the command line names, or all; 1 if one broke."""
     options = _parser().parse_args()
     about = machine()
     figures: list[Figure] = []
     methods: dict[str, str] = {}
+    failed: list[str] = []
     for name in options.names or BENCHMARKS:
         benchmark = BENCHMARKS[name]
         say(f"-- {name}")
-        figures += asyncio.run(benchmark.run(quick=options.quick))
         methods[name] = benchmark.METHOD
+        try:
+            figures += asyncio.run(benchmark.run(quick=options.quick))
+        except Exception:  # noqa: BLE001 - the figures of the others still count
+            traceback.print_exc()
+            failed.append(name)
     OUTPUT.mkdir(exist_ok=True)
     path = OUTPUT / "results.json"
     written = results(figures, about, methods, quick=options.quick)
@@ -35,6 +42,9 @@ def main() -> None:
     for name, method in methods.items():
         print(f"\n{name}: {method}")
     print(f"\n{table(figures)}\n\nWritten to {path}")
+    if failed:
+        print(f"Could not be taken: {', '.join(failed)}")
+    return bool(failed)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -51,4 +61,4 @@ def _parser() -> argparse.ArgumentParser:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
