@@ -171,6 +171,30 @@ async def test_only_listeners_of_what_changed_are_called(hass: HomeAssistant) ->
             stop()
 
 
+async def test_a_listener_that_fails_harms_nobody_else(
+    hass: HomeAssistant, caplog: pytest.LogCaptureFixture
+) -> None:
+    car = Car(reaction=0.0, ramp=0.1)
+    async with running(hass, AblBox(1, car=car)) as (entry, bus):
+        charging = await get_entity(hass, "binary_sensor", entry, "1_charging")
+        coordinator = entry.runtime_data
+
+        def fail() -> None:
+            message = "a mistake somewhere else"
+            raise RuntimeError(message)
+
+        for context in (BUS, ("abl1", None), ("abl1", 1)):
+            listeners = coordinator._listeners.setdefault(context, [])
+            listeners.insert(0, fail)
+        car.plug_in()
+        await wait_for_state(hass, charging, "on")
+        bus.unplug()
+        await wait_for_state(hass, charging, "unavailable")
+        bus.replug()
+        await wait_for_state(hass, charging, "on")
+        assert "a mistake somewhere else" in caplog.text
+
+
 async def test_only_what_changed_is_written(hass: HomeAssistant) -> None:
     """A module that charges costs its own entities, and of them those that move."""
     car = Car(reaction=0.0, ramp=8.0)

@@ -73,7 +73,9 @@ async def async_setup_entry(
 ) -> None:
     """Set up the binary sensors of a bus and of its chargers."""
     async_add_entities([ConnectedSensor(entry.runtime_data, CONNECTED)])
-    add_charger_entities(Platform.BINARY_SENSOR, entry, async_add_entities, _sensors)
+    add_charger_entities(
+        Platform.BINARY_SENSOR, entry, async_add_entities, _sensors, _unwanted
+    )
 
 
 def _sensors(
@@ -86,6 +88,11 @@ def _sensors(
     for number in sorted(unit.numbers):
         for description in supported(charger, CONNECTOR_SENSORS):
             yield ConnectorBinarySensor(coordinator, unit, number, description)
+
+
+def _unwanted(unit: ChargerUnit) -> Iterable[str]:
+    expire = unit.charger.config.order_lifetime is not None
+    return () if expire else (ORDERS_EXPIRED.key,)
 
 
 class ConnectedSensor(BusEntity, BinarySensorEntity):

@@ -20,6 +20,7 @@ from homeassistant.helpers.update_coordinator import BaseDataUpdateCoordinatorPr
 
 from .const import CONF_SERIAL, LOGGER, SUBENTRY_CHARGER
 from .devices import BusDevices, connector_key
+from .evse.listeners import tell
 from .evse.model import ChargerConfig, Orders
 from .issues import BusIssues
 from .orders import OrderStore
@@ -160,7 +161,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
             return
         LOGGER.debug("%s: its set-up was changed", config.name)
         if _changes_in_place(old.config, config):
-            old.config = config
+            old.set_up(config)
             self.devices.show_charger(unit)
             self._on_charger(unit)
             return
@@ -200,7 +201,13 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
     def _learn(self, unit: ChargerUnit) -> None:
         """Show what was not known of a charger before."""
         unit.numbers |= unit.connectors.keys()
-        shape = (unit.charger.capabilities, frozenset(unit.numbers), unit.charger.info)
+        charger = unit.charger
+        shape = (
+            charger.capabilities,
+            charger.config.order_lifetime is None,
+            frozenset(unit.numbers),
+            charger.info,
+        )
         if shape == unit.shape:
             return
         unit.shape = shape
@@ -300,8 +307,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
 
     @callback
     def _notify(self, context: Context) -> None:
-        for update_callback in tuple(self._listeners.get(context, ())):
-            update_callback()
+        tell(self._listeners.get(context, ()))
 
 
 def _changes_in_place(old: ChargerConfig, new: ChargerConfig) -> bool:

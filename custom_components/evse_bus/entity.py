@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final, Protocol, override
 
 from homeassistant.config_entries import ConfigEntryState
 from homeassistant.core import callback
+from homeassistant.helpers import entity_registry as er
 from homeassistant.helpers.device_registry import DeviceInfo
 from homeassistant.helpers.update_coordinator import BaseCoordinatorEntity
 
@@ -60,15 +61,26 @@ def add_charger_entities(
     entry: EvseBusConfigEntry,
     async_add_entities: AddConfigEntryEntitiesCallback,
     make: Callable[[BusCoordinator, ChargerUnit], Iterable[Entity]],
+    unwanted: Callable[[ChargerUnit], Iterable[str]] = lambda _unit: (),
 ) -> None:
-    """Add a platform's entities for each charger, now and as more is learnt."""
+    """Add a platform's entities for each charger, now and as more is learnt.
+
+    ``unwanted`` returns keys of those that a charger's set-up leaves no use for;
+    where they exist, they are removed.
+    """
     coordinator = entry.runtime_data
+    registry = er.async_get(coordinator.hass)
 
     @callback
     def add(unit: ChargerUnit) -> None:
         if entry.state not in _GROWING:
             # The bus still talks while the platforms are being unloaded.
             return
+        for key in unwanted(unit):
+            unique_id = f"{unit.subentry_id}_{key}"
+            unit.added.discard((domain, unique_id))
+            if known := registry.async_get_entity_id(domain, DOMAIN, unique_id):
+                registry.async_remove(known)
         new = [
             entity
             for entity in make(coordinator, unit)

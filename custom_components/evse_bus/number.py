@@ -39,6 +39,8 @@ LONGEST_TIMEOUT: Final = 3600
 SHORTEST_STEP: Final = 0.1
 """Finest step of a slider, A; what a protocol cannot say is rounded down."""
 
+FAIL_SAFE_CURRENT: Final = "fail_safe_current"
+
 
 def ceiling(limits: Limits) -> float:
     """Return the highest current that may be asked for, A.
@@ -136,7 +138,7 @@ NUMBERS: Final[tuple[OrderNumberDescription, ...]] = (
     ),
     *(_phase_limit(index) for index in range(3)),
     OrderNumberDescription(
-        key="fail_safe_current",
+        key=FAIL_SAFE_CURRENT,
         translation_key="fail_safe_current",
         entity_category=EntityCategory.CONFIG,
         exists=_falls_back,
@@ -171,12 +173,18 @@ async def async_setup_entry(
     async_add_entities: AddConfigEntryEntitiesCallback,
 ) -> None:
     """Set up the numbers of a bus's chargers."""
-    add_charger_entities(Platform.NUMBER, entry, async_add_entities, _numbers)
+    add_charger_entities(
+        Platform.NUMBER, entry, async_add_entities, _numbers, _unwanted
+    )
 
 
 def _numbers(coordinator: BusCoordinator, unit: ChargerUnit) -> Iterable[NumberEntity]:
     make = partial(OrderNumber, coordinator, unit)
     return (make(entry) for entry in NUMBERS if entry.exists(unit.charger))
+
+
+def _unwanted(unit: ChargerUnit) -> Iterable[str]:
+    return () if _falls_back(unit.charger) else (FAIL_SAFE_CURRENT,)
 
 
 class OrderNumber(ChargerEntity, NumberEntity):

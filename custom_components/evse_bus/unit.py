@@ -26,7 +26,7 @@ class ChargerUnit:
         self.numbers: set[int] = set()
         """Connectors seen since the start."""
         self.shape: object = None
-        """Capabilities and connectors that entities have been made for."""
+        """What entities have been made for: capabilities, connectors and the like."""
         self.unsubscribe: CALLBACK_TYPE = lambda: None
 
     @property

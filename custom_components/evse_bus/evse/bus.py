@@ -17,6 +17,7 @@ from .exchange import Talk, Wire
 from .framing import Frame, Framer, Timing
 from .jobs import Job, JobQueue, Later, Step
 from .line import Line
+from .listeners import tell
 from .model import (
     EvseError,
     ExchangeRefusedError,
@@ -80,7 +81,7 @@ class Bus:
         stopped = NotAvailableError(f"{self.name} is stopped")
         self._jobs.fail_all(stopped, begun=False)
         if self._task is not None:
-            self._look_again()
+            self.look_again()
             done, _ = await asyncio.wait({self._task}, timeout=STOP_PATIENCE)
             if not done:
                 self._task.cancel()
@@ -105,7 +106,7 @@ class Bus:
         charger.bus = self
         self.chargers[charger.config.key] = charger
         charger.slot.worst_case = self.worst_case(charger)
-        self._look_again()
+        self.look_again()
 
     async def remove(self, charger: Charger) -> None:
         """Take a charger off; what it has begun (waking a car) is finished first."""
@@ -161,7 +162,7 @@ class Bus:
         else:
             self._jobs.add(job)
             self._respect_minimum(job.charger)
-            self._look_again()
+            self.look_again()
         # Whoever waits may give up; the command itself is still carried out. (A
         # shield would report its failure, which then interests nobody.)
         await asyncio.wait({job.future})
@@ -332,7 +333,7 @@ class Bus:
                 persistence=persistence,
             )
         )
-        self._look_again()
+        self.look_again()
 
     def _respect_minimum(self, charger: Charger | None) -> None:
         """Let nothing be said to a charger before its minimum interval is over."""
@@ -373,7 +374,7 @@ class Bus:
             charger.slot.start_by = inf
             charger.set_unavailable()
         self._tell()
-        self._look_again()
+        self.look_again()
 
     async def _reopen(self) -> bool:
         """Open the port again, however long it takes; False when told to stop."""
@@ -395,8 +396,7 @@ class Bus:
             return True
 
     def _tell(self) -> None:
-        for listener in tuple(self._listeners):
-            listener()
+        tell(self._listeners)
 
     # -- Sleeping and waking -----------------------------------------------------
 
@@ -405,7 +405,7 @@ class Bus:
         self._wake = loop.create_future()
         handle = None
         if wake_at < inf:
-            handle = loop.call_at(wake_at, self._look_again)
+            handle = loop.call_at(wake_at, self.look_again)
         try:
             await self._wake
         finally:
@@ -413,7 +413,8 @@ class Bus:
             if handle is not None:
                 handle.cancel()
 
-    def _look_again(self) -> None:
+    def look_again(self) -> None:
+        """Choose anew who speaks next: something has changed."""
         if self._wake is not None and not self._wake.done():
             self._wake.set_result(None)
 

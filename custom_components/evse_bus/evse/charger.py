@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, ClassVar
 from .exchange import Talk
 from .framing import Frame, Timing
 from .jobs import Job, Later, Step
+from .listeners import tell
 from .model import (
     Capability,
     ChargerConfig,
@@ -155,6 +156,18 @@ class Charger(ABC):
     def plan(self, now: float) -> None:
         """Say in `slot` when the next regular exchange may and must be."""
         self.slot.ready = self.slot.due = now + self.config.poll_interval
+
+    def set_up(self, config: ChargerConfig) -> None:
+        """Follow a changed set-up at once: a lower limit waits for no poll.
+
+        Who the charger is and how it is spoken to must be the same as before.
+        """
+        self.config = config
+        now = asyncio.get_running_loop().time()
+        soon = now + self.minimum_pause(now)
+        self.slot.ready = self.slot.due = min(self.slot.ready, soon)
+        if self.bus is not None:
+            self.bus.look_again()
 
     # -- What the bus tells ------------------------------------------------------
 
@@ -334,8 +347,7 @@ class Charger(ABC):
     def updated(self) -> None:
         """Tell the listeners."""
         self.last_told = self.told
-        for listener in tuple(self._listeners):
-            listener()
+        tell(self._listeners)
 
     async def wait_available(self, patience: float = 60.0) -> ChargerReading:
         """Return the first reading, as soon as there is one.

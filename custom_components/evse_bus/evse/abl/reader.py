@@ -118,6 +118,11 @@ class AblReader(Charger):
         self._flags_missed = 0
         self._energy = EnergyEstimate(config.poll_interval)
 
+    @override
+    def set_up(self, config: ChargerConfig) -> None:
+        super().set_up(config)
+        self._energy.expect(config.poll_interval)
+
     @property
     @override
     def capabilities(self) -> frozenset[Capability]:

@@ -46,8 +46,13 @@ class EnergyEstimate:
         """Start at 0 Wh."""
         self.energy = 0.0
         """Wh"""
-        self._longest = max(GAP_INTERVALS * poll_interval, SHORTEST_GAP)
+        self._longest = 0.0
         self._last: tuple[float, float] | None = None
+        self.expect(poll_interval)
+
+    def expect(self, poll_interval: float) -> None:
+        """Take what is much longer than this (s) between two readings for a gap."""
+        self._longest = max(GAP_INTERVALS * poll_interval, SHORTEST_GAP)
 
     def add(self, power: float | None, now: float) -> None:
         """Take a power (W) at a time (s)."""
