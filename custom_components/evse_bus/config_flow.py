@@ -228,6 +228,8 @@ class EvseBusConfigFlow(
     @override
     def finish(self, chargers: list[ConfigSubentryData]) -> ConfigFlowResult:
         """Create the bus with its chargers."""
+        # Another dialogue may have been quicker.
+        self._async_abort_entries_match({CONF_DEVICE: self.bus_data[CONF_DEVICE]})
         return self.async_create_entry(
             title=_title(self.bus_data), data=self.bus_data, subentries=chargers
         )

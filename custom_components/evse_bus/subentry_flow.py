@@ -11,7 +11,7 @@ from homeassistant.config_entries import (
     SubentryFlowContext,
     SubentryFlowResult,
 )
-from homeassistant.const import CONF_NAME
+from homeassistant.const import CONF_ADDRESS, CONF_NAME
 
 from .const import (
     CONF_FAIL_SAFE_CURRENT,
@@ -89,6 +89,9 @@ class ChargerSubentryFlow(
     def finish(self, chargers: list[ConfigSubentryData]) -> SubentryFlowResult:
         """Create the charger."""
         [charger] = chargers
+        # Another dialogue may have been quicker.
+        if charger["data"][CONF_ADDRESS] in self.taken():
+            return self.async_abort(reason="already_configured")
         return self.async_create_entry(
             title=charger["title"],
             data=charger["data"],
