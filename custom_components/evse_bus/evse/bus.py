@@ -69,9 +69,19 @@ class Bus:
     # -- Life --------------------------------------------------------------------
 
     async def start(self) -> None:
-        """Open the port and start; raises LineError when it cannot be opened."""
-        await self.line.open()
+        """Open the port and start; one that runs already goes on.
+
+        Raises LineError when the port cannot be opened, NotAvailableError when
+        `stop` came first.
+        """
+        if self._task is not None:
+            return
         self._stopping = False
+        await self.line.open()
+        if self._stopping:
+            await self.line.close()
+            message = f"{self.name} was stopped while it started"
+            raise NotAvailableError(message)
         self._on_open()
         self._task = asyncio.create_task(self._run(), name=f"bus {self.name}")
 
@@ -162,7 +172,7 @@ class Bus:
         else:
             self._jobs.add(job)
             self._respect_minimum(job.charger)
-            self.look_again()
+        self.look_again()
         # Whoever waits may give up; the command itself is still carried out. (A
         # shield would report its failure, which then interests nobody.)
         await asyncio.wait({job.future})
@@ -194,30 +204,41 @@ class Bus:
     async def _run(self) -> None:
         loop = asyncio.get_running_loop()
         while True:
-            if not self.line.is_open and not await self._reopen():
-                return
-            slots = self._slots()
-            if self._stopping and not slots:
-                return
-            now = loop.time()
-            choice = choose(slots, now, self._last_probe)
-            if choice.slot is None:
-                await self._sleep_until(choice.wake_at)
-                continue
-            self.wire.statistics.for_deadline += choice.for_deadline
-            self._turn_of = choice.slot
+            slot = None
             try:
-                await self._turn(choice.slot, now)
-            finally:
-                self._turn_of = None
-                self._turn_over.set()
-                self.wire.statistics.busy(now, loop.time())
+                if not self.line.is_open and not await self._reopen():
+                    return
+                slots = self._slots()
+                if self._stopping and not slots:
+                    return
+                choice = choose(slots, loop.time(), self._last_probe)
+                slot = choice.slot
+                if slot is None:
+                    await self._sleep_until(choice.wake_at)
+                    continue
+                self.wire.statistics.for_deadline += choice.for_deadline
+                await self._serve(slot)
+            except Exception:
+                # Without this task all chargers of the bus would fall silent.
+                _LOGGER.exception("%s: a turn failed unforeseen", self.name)
+                if slot is not None:
+                    slot.ready = loop.time() + self.wire.timing.backoff
+
+    async def _serve(self, slot: Slot) -> None:
+        now = asyncio.get_running_loop().time()
+        self._turn_of = slot
+        try:
+            await self._turn(slot, now)
+        finally:
+            self._turn_of = None
+            self._turn_over.set()
+            self.wire.statistics.busy(now, asyncio.get_running_loop().time())
 
     def _slots(self) -> list[Slot]:
         if self._stopping:
             return [job for job in self._jobs if job.begun]
         slots: list[Slot] = [charger.slot for charger in self.chargers.values()]
-        slots.extend(self._jobs)
+        slots.extend(self._jobs.eligible())
         return slots
 
     async def _turn(self, slot: Slot, now: float) -> None:

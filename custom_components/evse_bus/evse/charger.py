@@ -226,7 +226,7 @@ class Charger(ABC):
         if lowered != self.orders:
             self.orders = lowered
             self.updated()
-            await self.commit(lowered)
+            await self._store(lowered)
         bus = self._bus()
         pause = checked.allowed is False
         if pause:
@@ -266,8 +266,15 @@ class Charger(ABC):
         self.orders = stands
         self.updated()
         if changed:
-            await self.commit(stands)
+            await self._store(stands)
         return None
+
+    async def _store(self, orders: Orders) -> None:
+        try:
+            await self.commit(orders)
+        except Exception:
+            # A full disk must not keep a pause from the wire.
+            _LOGGER.exception("%s: orders were not stored", self.config.name)
 
     def careful(self, orders: Orders) -> Orders:
         """Return orders on their way, lowered to what the user has said since.

@@ -106,6 +106,10 @@ class Wire:
                 self.line.answered()
                 self.statistics.replies += 1
                 counted.reply(pending.answered_at - started)
+        if not self.line.is_open:
+            # Lost in the same breath: nothing may go on from here.
+            message = f"{self.line.url} was lost"
+            raise LineLostError(message)
         return result  # type: ignore[return-value] # accept's own type
 
     async def _silence(self) -> None:

@@ -48,6 +48,15 @@ class Job(Slot):
         default_factory=lambda: asyncio.get_running_loop().create_future()
     )
 
+    @property
+    def raises(self) -> bool:
+        """Return whether it asks for more than stands."""
+        if self.charger is None or self.change is None or self.change.allowed is False:
+            return False
+        orders = self.charger.orders
+        # What it lowers has been lowered when it was said.
+        return self.change.allowed is True or self.change.apply(orders) != orders
+
 
 class JobQueue:
     """What waits for the bus besides the regular polls."""
@@ -63,6 +72,19 @@ class JobQueue:
     def __contains__(self, job: object) -> bool:
         """Return whether a job still waits."""
         return job in self._jobs
+
+    def eligible(self) -> Iterator[Job]:
+        """Return what may have a turn now, as far as the queue is concerned.
+
+        A lowering or a pause goes at any time. A raise or a start waits for the
+        changes before it: half done or to be repeated, their end would undo it.
+        """
+        changing: set[Charger | None] = set()
+        for job in self._jobs:
+            if job.charger not in changing or not job.raises:
+                yield job
+            if job.change is not None:
+                changing.add(job.charger)
 
     def add(self, job: Job) -> None:
         """Let a job wait."""

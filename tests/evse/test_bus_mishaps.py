@@ -1,0 +1,235 @@
+"""What must not bring a bus down, in simulated time."""
+
+import asyncio
+from typing import override
+
+import pytest
+
+from custom_components.evse_bus.evse.exchange import Talk
+from custom_components.evse_bus.evse.jobs import Later
+from custom_components.evse_bus.evse.model import (
+    LineLostError,
+    NotAvailableError,
+    OrderChange,
+    Orders,
+)
+from custom_components.evse_bus.evse.safety import clamp
+
+from .simulated import Scene, SimulatedCharger, SimulatedLine, simulate
+
+
+class SlowCharger(SimulatedCharger):
+    """Is sure of an order only in a second turn, as a box that takes its time."""
+
+    @override
+    async def impose(  # type: ignore[override]
+        self, talk: Talk, orders: Orders, change: OrderChange
+    ) -> Later[None] | None:
+        async def verify(talk: Talk) -> None:
+            await self.say(talk, "V")
+
+        orders = self.careful(orders)
+        await self.say(talk, "W", int(clamp(orders, self.limits).current))
+        return Later(1.0, verify)
+
+
+def slow(scene: Scene) -> SlowCharger:
+    plain = scene.make(1)
+    charger = SlowCharger(plain.config, plain.orders)
+    scene.bus.add(charger)
+    return charger
+
+
+def writes(scene: Scene) -> list[int]:
+    return [sent.value for sent in scene.line.sent if sent.command == "W"]
+
+
+def test_a_plan_that_fails_does_not_end_the_bus(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def scene() -> None:
+        async with Scene(addresses=(1, 2), interval=1.0) as bus:
+            await asyncio.sleep(2)
+
+            def broken(_now: float) -> None:
+                raise ZeroDivisionError
+
+            monkeypatch.setattr(bus.charger(1), "plan", broken)
+            count = len(bus.line.times(2))
+            await asyncio.sleep(20)
+            assert len(bus.line.times(2)) - count >= 18
+            # The other one is not asked in a frenzy either.
+            assert len(bus.line.times(1)) <= 10
+
+    simulate(scene())
+
+
+def test_a_lowering_that_cannot_be_stored_is_sent_all_the_same() -> None:
+    async def scene() -> None:
+        async with Scene(interval=60.0) as bus:
+            await asyncio.sleep(1)
+            charger = bus.charger(1)
+
+            async def full(_orders: Orders) -> None:
+                raise OSError("disk full")
+
+            charger.commit = full
+            await charger.change_orders(OrderChange(allowed=False))
+            assert writes(bus) == [0]
+            await charger.change_orders(OrderChange(allowed=True))
+            assert writes(bus) == [0, 10]
+            assert charger.orders.allowed is True
+
+    simulate(scene())
+
+
+def test_a_second_start_changes_nothing() -> None:
+    async def scene() -> None:
+        async with Scene(interval=1.0) as bus:
+            await bus.bus.start()
+            assert len(asyncio.all_tasks()) == 2
+            await asyncio.sleep(10)
+            assert len(bus.line.times(1)) <= 11
+        assert len(asyncio.all_tasks()) == 1
+
+    simulate(scene())
+
+
+def test_a_stop_ends_a_start_that_has_not_ended() -> None:
+    async def scene() -> None:
+        bus = Scene()
+        opened = asyncio.Event()
+
+        class SlowLine(SimulatedLine):
+            @override
+            async def open(self) -> None:
+                await opened.wait()
+                await super().open()
+
+        bus.line.__class__ = SlowLine
+        starting = asyncio.create_task(bus.bus.start())
+        await asyncio.sleep(0)
+        await bus.bus.stop()
+        opened.set()
+        with pytest.raises(NotAvailableError):
+            await starting
+        assert not bus.line.is_open
+        assert len(asyncio.all_tasks()) == 1
+
+    simulate(scene())
+
+
+def test_an_answer_in_the_last_breath_of_a_port_is_no_reading() -> None:
+    async def scene() -> None:
+        async with Scene(interval=1.0) as bus:
+            await asyncio.sleep(0.5)
+            charger = bus.charger(1)
+            assert charger.available
+            hear = bus.line.hear
+
+            def hear_and_lose(data: bytes) -> None:
+                hear(data)
+                bus.line.refuse_open = LineLostError("gone")
+                bus.line.unplug()
+
+            bus.line.hear = hear_and_lose  # type: ignore[method-assign]
+            await asyncio.sleep(2)
+            assert not charger.available
+            assert charger.reading is None
+
+    simulate(scene())
+
+
+def test_a_conversation_does_not_outlive_its_port() -> None:
+    async def scene() -> None:
+        async with Scene(interval=60.0) as bus:
+            await asyncio.sleep(1)
+            charger = slow(bus)
+            await asyncio.sleep(1)
+            hear = bus.line.hear
+
+            def hear_and_lose(data: bytes) -> None:
+                hear(data)
+                bus.line.hear = hear  # type: ignore[method-assign]
+                bus.line.unplug()
+
+            bus.line.hear = hear_and_lose  # type: ignore[method-assign]
+            with pytest.raises(LineLostError):
+                await charger.change_orders(OrderChange(current=20.0))
+            await asyncio.sleep(30)
+            # Who answers behind a port that is back has to be asked first.
+            assert bus.line.times(1, "V") == []
+
+    simulate(scene())
+
+
+def test_a_raise_is_not_undone_by_the_end_of_an_older_change() -> None:
+    async def scene() -> None:
+        async with Scene(interval=60.0) as bus:
+            charger = slow(bus)
+            await asyncio.sleep(1)
+            changes = (
+                OrderChange(current=8.0),
+                OrderChange(allowed=False),
+                OrderChange(current=20.0),
+                OrderChange(current=25.0),
+                OrderChange(allowed=True),
+            )
+            tasks = []
+            for change in changes:
+                tasks.append(asyncio.create_task(charger.change_orders(change)))
+                await asyncio.sleep(0.3)
+            await asyncio.gather(*tasks)
+            assert writes(bus)[-1] == 25
+            assert charger.orders.limit.current == 25.0
+            assert charger.orders.allowed is True
+
+    simulate(scene())
+
+
+def test_a_pause_or_lowering_waits_for_no_change_under_way() -> None:
+    async def scene() -> None:
+        async with Scene(interval=60.0) as bus:
+            charger = slow(bus)
+            await asyncio.sleep(1)
+            raising = asyncio.create_task(
+                charger.change_orders(OrderChange(current=20.0))
+            )
+            await asyncio.sleep(0.1)
+            tasks = [
+                asyncio.create_task(charger.change_orders(OrderChange(current=25.0)))
+            ]
+            await asyncio.sleep(0.1)
+            # Merged with the raise that waits, and no raise any more.
+            tasks.append(
+                asyncio.create_task(charger.change_orders(OrderChange(current=7.0)))
+            )
+            await asyncio.sleep(0.1)
+            assert writes(bus) == [20, 7]
+            # Whatever else a pause brings along.
+            pause = OrderChange(allowed=False, current=30.0)
+            tasks.append(asyncio.create_task(charger.change_orders(pause)))
+            await asyncio.sleep(0.1)
+            assert writes(bus) == [20, 7, 0]
+            await asyncio.gather(raising, *tasks)
+            assert charger.orders.allowed is False
+
+    simulate(scene())
+
+
+def test_a_pause_that_is_said_again_does_not_overtake_the_start_after_it() -> None:
+    async def scene() -> None:
+        async with Scene(interval=60.0) as bus:
+            await asyncio.sleep(1)
+            charger = bus.charger(1)
+            bus.line.devices[1].lose_next = 1
+            pause = asyncio.create_task(
+                charger.change_orders(OrderChange(allowed=False))
+            )
+            await asyncio.sleep(0.3)
+            await charger.change_orders(OrderChange(allowed=True))
+            await pause
+            assert writes(bus) == [0, 0, 10]
+            assert charger.orders.allowed is True
+
+    simulate(scene())
