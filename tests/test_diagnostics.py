@@ -115,8 +115,54 @@ async def test_of_one_device(hass: HomeAssistant) -> None:
             b">010310500032573232787930313233343536",
             b">01031050" + b"*" * 28,
         ),
+        ("evbox", b"\x0280A06801", b"\x0280A068**"),
+        ("abl", b">010310503257", b">01031050****"),
         ("abl", b">01030A2EA1106403E803E803E8EE", b">01030A2EA1106403E803E803E8EE"),
     ],
 )
 def test_serial_numbers_in_frames(protocol: str, data: bytes, shown: bytes) -> None:
     assert without_serial(protocol, data) == shown
+
+
+@pytest.mark.parametrize(
+    ("protocol", "data", "shown"),
+    [
+        # Read in two lumps: the second one begins in the middle.
+        ("evbox", b"923054003C\x03", b"********3C\x03"),
+        ("abl", b"3233343536AE\r\n", b"************\r\n"),
+        ("evbox", b"\x02A08069", b"\x02A08069"),
+        # Another command was made of 68 on the way.
+        ("evbox", b"\x02A0804801923054", b"\x02A08048********"),
+        ("abl", b">0103105132573232AE", b">01031051********AE"),
+    ],
+)
+def test_serial_numbers_in_pieces(protocol: str, data: bytes, shown: bytes) -> None:
+    serials = {"evbox": b"01923054", "abl": b"32573232"}
+    assert without_serial(protocol, data, [serials[protocol]], whole=False) == shown
+
+
+@pytest.mark.parametrize("protocol", ["abl", "evbox"])
+async def test_a_bad_line_tells_no_serial_number(
+    hass: HomeAssistant, protocol: str
+) -> None:
+    """Answers cut, damaged and delivered in lumps."""
+    box = (
+        AblBox(1, serial="2W22xy01234567")
+        if protocol == "abl"
+        else EvboxChargePoint(1923054, 2, min_interval=0)
+    )
+    async with running(hass, box, poll_interval=0.2) as (entry, bus):
+        await get_entity(hass, "sensor", entry, "1_current_l1")
+        for _ in range(2):
+            box.faults.once("corrupt")
+            box.faults.once("truncate")
+        log = entry.runtime_data.bus.wire.frames
+
+        def unreadable() -> int:
+            return sum(frame.direction == "unreadable" for frame in log)
+
+        await bus.wait_for_async(unreadable, timeout=20)
+        data = await diagnostics(hass, entry)
+        everything = "\n".join(texts(data["frames"]))
+        assert "1923054" not in everything
+        assert box.serial.encode().hex().upper() not in everything

@@ -4,6 +4,7 @@ from math import inf, nan
 
 from homeassistant.core import HomeAssistant
 from homeassistant.exceptions import HomeAssistantError, ServiceValidationError
+import probatio as vol
 import pytest
 
 from tests.common import (
@@ -39,10 +40,15 @@ async def test_a_limit_is_on_the_box_when_the_service_returns(
 
 @pytest.mark.parametrize(
     ("value", "where"),
-    [(nan, 16), (inf, 16), (-inf, 16), (-6, 16), (10000, 16), (5, 16)],
+    [
+        *((nan, 16), (inf, 16), (-inf, 16), (-6, 16), (10000, 16), (5, 16)),
+        *((-1, 16), (0, 16), (5.9, 16), (16.1, 16)),
+        # As templates bring it.
+        *(("nan", 16), ("inf", 16), ("-1", 16), ("1e4", 16), ("5.9", 16)),
+    ],
 )
 async def test_absurd_values_are_refused(
-    hass: HomeAssistant, value: float, where: float
+    hass: HomeAssistant, value: float | str, where: float
 ) -> None:
     box = AblBox(1)
     async with running(hass, box) as (entry, _):
@@ -53,6 +59,31 @@ async def test_absurd_values_are_refused(
             await call(hass, "number.set_value", limit, value=value)
         assert len(box.writes) == written
         assert state_of(hass, limit) == str(float(where))
+
+
+@pytest.mark.parametrize("value", ["unknown", "unavailable", "", None, [], {}])
+async def test_what_is_no_value_is_refused(hass: HomeAssistant, value: object) -> None:
+    box = AblBox(1)
+    async with running(hass, box) as (entry, _):
+        limit = await get_entity(hass, "number", entry, "charging_current")
+        written = len(box.writes)
+        with pytest.raises(vol.Invalid):
+            await call(hass, "number.set_value", limit, value=value)
+        assert len(box.writes) == written
+
+
+@pytest.mark.parametrize(("asked", "sent_as"), [(6.97, 6.9), (6.9, 6.9), (15.99, 15.9)])
+async def test_values_between_two_steps_are_rounded_down(
+    hass: HomeAssistant, asked: float, sent_as: float
+) -> None:
+    box = EvboxChargePoint(1923054, 1, min_interval=0)
+    async with running(hass, box, poll_interval=0.5) as (entry, _):
+        maximum = await get_entity(hass, "sensor", entry, "maximum_current")
+        await wait_for_state(hass, maximum, "35.0")
+        limit = await get_entity(hass, "number", entry, "charging_current")
+        await call(hass, "number.set_value", limit, value=asked)
+        assert box.limits_in_force == (sent_as,) * 3
+        assert state_of(hass, limit) == str(sent_as)
 
 
 async def test_not_a_number_says_why(hass: HomeAssistant) -> None:

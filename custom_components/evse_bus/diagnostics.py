@@ -1,6 +1,6 @@
 """Diagnostics: all that helps to find a fault, without what identifies a house."""
 
-from collections.abc import Mapping, Set as AbstractSet
+from collections.abc import Iterable, Mapping, Set as AbstractSet
 from dataclasses import fields, is_dataclass
 from datetime import UTC, datetime
 from math import isfinite
@@ -14,6 +14,7 @@ from homeassistant.helpers.device_registry import ChildDeviceEntry, DeviceEntry
 
 from .const import CONF_SERIAL, DOMAIN
 from .coordinator import BusCoordinator, EvseBusConfigEntry
+from .evse.statistics import Direction
 from .unit import ChargerUnit
 
 # An adapter's path and a network address name the house as a serial number does.
@@ -22,11 +23,16 @@ _PRIVATE: Final = {CONF_DEVICE, CONF_SERIAL, "serials", "information"}
 _PRIVATE_ADDRESS: Final = {"evbox"}
 
 _SERIAL_IN_FRAME: Final[Mapping[str, re.Pattern[bytes]]] = {
-    # EVBox: eight digits behind command 68.
-    "evbox": re.compile(rb"(?<=68)[0-9]{8}"),
+    # EVBox: eight digits behind command 68; fewer where a frame was cut off.
+    "evbox": re.compile(rb"(?<=68)[0-9]{8}|(?<=A08068|80A068)[0-9]{1,8}"),
     # ABL: the answer to a read of register 0x50, whose first byte repeats the 50.
-    "abl": re.compile(rb"(?<=50)[0-9A-F]{20,}"),
+    "abl": re.compile(rb"(?<=03[0-9A-F]{2}50)[0-9A-F]+"),
 }
+_REST_OF_SERIAL: Final[Mapping[str, re.Pattern[bytes]]] = {
+    "evbox": re.compile(rb"\A[0-9]{1,8}"),
+    "abl": re.compile(rb"\A[0-9A-F]+"),
+}
+"""What a piece without its beginning may begin with."""
 
 
 async def async_get_config_entry_diagnostics(
@@ -98,20 +104,54 @@ def _charger(coordinator: BusCoordinator, unit: ChargerUnit) -> dict[str, Any]:
 
 
 def _frames(coordinator: BusCoordinator) -> list[dict[str, str]]:
+    protocol = coordinator.protocol.key
+    serials = _serials(coordinator)
     return [
         {
             "time": datetime.fromtimestamp(frame.when, UTC).isoformat(),
             "direction": str(frame.direction),
-            "hex": without_serial(coordinator.protocol.key, frame.data).hex(),
+            "hex": without_serial(
+                protocol,
+                frame.data,
+                serials,
+                whole=frame.direction is not Direction.UNREADABLE,
+            ).hex(),
         }
         for frame in coordinator.bus.wire.frames
     ]
 
 
-def without_serial(protocol: str, data: bytes) -> bytes:
-    """Return bytes as they passed, serial numbers replaced by asterisks."""
-    pattern = _SERIAL_IN_FRAME[protocol]
-    return pattern.sub(lambda found: b"*" * len(found.group()), data)
+def _serials(coordinator: BusCoordinator) -> list[bytes]:
+    """Return the serial numbers known, as they pass on the wire."""
+    chargers = [unit.charger for unit in coordinator.units.values()]
+    told = {one.config.serial for one in chargers}
+    told |= {one.info.serial for one in chargers if one.info is not None}
+    known = [serial for serial in told if serial]
+    if coordinator.protocol.key in _PRIVATE_ADDRESS:
+        return [serial.zfill(8).encode() for serial in known]
+    return [serial.encode().hex().upper().encode() for serial in known]
+
+
+def without_serial(
+    protocol: str,
+    data: bytes,
+    serials: Iterable[bytes] = (),
+    *,
+    whole: bool = True,
+) -> bytes:
+    """Return bytes as they passed, serial numbers replaced by asterisks.
+
+    ``serials`` are hidden wherever they stand, also in a damaged frame. A piece
+    that is not ``whole`` may begin in the middle of one.
+    """
+    for serial in serials:
+        data = data.replace(serial, b"*" * len(serial))
+    data = _SERIAL_IN_FRAME[protocol].sub(_hide, data)
+    return data if whole else _REST_OF_SERIAL[protocol].sub(_hide, data)
+
+
+def _hide(found: re.Match[bytes]) -> bytes:
+    return b"*" * len(found.group())
 
 
 def plain(value: object) -> Any:  # noqa: ANN401 - JSON has no better type

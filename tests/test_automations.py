@@ -1,0 +1,82 @@
+"""The automations of the README, as they stand there."""
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from datetime import timedelta
+from pathlib import Path
+import re
+
+from homeassistant.core import HomeAssistant
+from homeassistant.setup import async_setup_component
+from homeassistant.util import dt as dt_util
+from homeassistant.util.yaml import parse_yaml
+import pytest
+from pytest_homeassistant_custom_component.common import async_fire_time_changed
+
+from tests.common import call, get_entity, running, wait_for_state
+from tests.virtual import AblBox
+
+README = Path(__file__).parents[1] / "README.md"
+
+
+@asynccontextmanager
+async def automated(hass: HomeAssistant, alias: str) -> AsyncIterator[None]:
+    """Run one of the README's automations."""
+    blocks = re.findall(r"```yaml\n(.*?)```", README.read_text(), re.DOTALL)
+    (wanted,) = (
+        parsed
+        for block in blocks
+        if (parsed := parse_yaml(block)).get("alias") == alias
+    )
+    assert await async_setup_component(hass, "automation", {"automation": wanted})
+    await hass.async_block_till_done()
+    (automation,) = hass.states.async_all("automation")
+    assert automation.state == "on"
+    try:
+        yield
+    finally:
+        await hass.async_block_till_done()
+        await call(hass, "automation.turn_off", automation.entity_id)
+
+
+@pytest.mark.parametrize(
+    ("export", "amperes"),
+    [(-7000, None), (-2760, 6), (-2070, 7), (0, 10), (1400, 12), (9000, 16)],
+)
+async def test_charge_from_the_sun(
+    hass: HomeAssistant, export: float, amperes: int | None
+) -> None:
+    """At 10 A the house has this much to give away (W)."""
+    box = AblBox(1)
+    async with running(hass, box, title="Carport") as (entry, bus):
+        limit = await get_entity(hass, "number", entry, "charging_current")
+        allowed = await get_entity(hass, "switch", entry, "charging_allowed")
+        assert (limit, allowed) == (
+            "number.carport_charging_current",
+            "switch.carport_charging_allowed",
+        )
+        await call(hass, "number.set_value", limit, value=10)
+        await call(hass, "switch.turn_on", allowed)
+        hass.states.async_set("sensor.grid_export_power", str(export))
+        async with automated(hass, "Charge from the sun"):
+            minute = dt_util.utcnow().replace(second=0, microsecond=600_000)
+            async_fire_time_changed(hass, minute + timedelta(minutes=1))
+            if amperes is None:
+                await wait_for_state(hass, allowed, "off")
+                await bus.wait_for_async(lambda: box.ic_amps == 0)
+                return
+            await wait_for_state(hass, limit, str(float(amperes)))
+            await wait_for_state(hass, allowed, "on")
+            await bus.wait_for_async(lambda: amperes - 0.06 < box.ic_amps <= amperes)
+
+
+async def test_spare_the_main_fuse(hass: HomeAssistant) -> None:
+    box = AblBox(1)
+    async with running(hass, box, title="Carport") as (entry, bus):
+        limit = await get_entity(hass, "number", entry, "charging_current")
+        await call(hass, "number.set_value", limit, value=16)
+        hass.states.async_set("sensor.main_current_l1", "20")
+        async with automated(hass, "Spare the main fuse"):
+            hass.states.async_set("sensor.main_current_l1", "24.5")
+            await wait_for_state(hass, limit, "6.0")
+            await bus.wait_for_async(lambda: box.ic_amps <= 6)
