@@ -94,7 +94,7 @@ class AblCharger(AblReader):
         if self._conversations:
             return None
         if self.owes is not None:
-            if raw.state == self.owes.state:
+            if self.owes.is_open(raw.state):
                 return Later(0.0, in_turns(self._commands.give_back))
             self.owes = None
         if self._must_assert(raw):

@@ -23,7 +23,7 @@ from ..model import (
 )
 from ..turns import Turns
 from .dialogue import Debt, Dialogue
-from .duty import PAUSE, is_within
+from .duty import PAUSE
 from .registers import (
     ADDRESSES,
     StateCode,
@@ -120,25 +120,21 @@ class CommandSet(Dialogue):
                     raise self._refuse_in(reading, "only E0 and E2 can be left")
                 async for pause in self._enable(talk):
                     yield pause
-        elif reading.state != E0:
-            async for pause in self._reach_state(
-                talk, StateCode.E0, lambda now: now.state == E0
-            ):
+            self._charger.owes = None
+        else:
+            async for pause in self._disable(talk):
                 yield pause
 
     async def _enable(self, talk: Talk) -> Turns:
         """Enable the outlet, with the limit that stands."""
         charger = self._charger
         paused = self._state().duty == PAUSE
-        if not is_within(self._state().duty, limit_duty(charger.setpoint)):
-            # First the limit: enabled, a car may begin at once.
-            async for pause in charger.enforce(talk, lambda: charger.setpoint):
-                yield pause
+        async for pause in self._limit_first(talk):
+            yield pause
         async for pause in self._reach_state(
             talk, StateCode.A1, lambda now: now.state not in (E0, E2)
         ):
             yield pause
-        charger.owes = None
         if not paused and self._state().duty < limit_duty(charger.setpoint) != PAUSE:
             # Limits raised while the outlet was disabled have only been stored.
             async for pause in charger.enforce(talk, lambda: charger.setpoint):
@@ -155,7 +151,7 @@ class CommandSet(Dialogue):
             raise self._refuse_in(reading, "only a car that may charge can be woken")
         if reading.duty == PAUSE or charger.setpoint.paused:
             raise self._refuse_in(reading, "charging is paused, waking would not help")
-        charger.owes = Debt(E0, StateCode.A1)
+        charger.owes = Debt(StateCode.A1, E0)
         try:
             confirmed = await self._say(talk, StateCode.E0)
         except ExchangeRefusedError:
@@ -182,6 +178,8 @@ class CommandSet(Dialogue):
         async for pause in self._reach(talk):
             yield pause
         before = self._state()
+        if before.state == E0:
+            self._charger.owes = Debt(StateCode.E0)
         self._hold_polls(talk)
         confirmed = await self._say(talk, StateCode.RESET)
         async for pause in self._after_reset(talk, was_disabled=before.state == E0):

@@ -20,7 +20,7 @@ from ..turns import Turns
 from .duty import is_within
 from .exchanges import set_state
 from .registers import Reading, StateCode, limit_duty
-from .states import E0, state_of
+from .states import E0, E2, state_of
 
 if TYPE_CHECKING:
     from .charger import AblCharger
@@ -51,8 +51,13 @@ class Pauses:
 class Debt:
     """A state that a command brings about on its way, and what ends it."""
 
-    state: int
     end: StateCode
+    state: int | None = None
+    """``None``: any but E0 (a disabled outlet that is being reset)."""
+
+    def is_open(self, state: int) -> bool:
+        """Return whether a box in this state still has to be led out of it."""
+        return state != E0 if self.state is None else state == self.state
 
 
 class Dialogue:
@@ -136,14 +141,29 @@ class Dialogue:
             except ReplyTimeoutError:
                 if look == BOOT_LOOKS - 1:
                     raise
+        async for pause in self._limit_first(talk):
+            yield pause
+        if was_disabled:
+            async for pause in self._disable(talk):
+                yield pause
+        elif self._state().state != E2:
+            charger.owes = None
+
+    async def _limit_first(self, talk: Talk) -> Turns:
+        """Bring the limit down: enabled, a car may begin at once."""
+        charger = self._charger
         if not is_within(self._state().duty, limit_duty(charger.setpoint)):
             async for pause in charger.enforce(talk, lambda: charger.setpoint):
                 yield pause
-        if was_disabled and self._state().state != E0:
+
+    async def _disable(self, talk: Talk) -> Turns:
+        """Disable the outlet; from then on it is to be so."""
+        if self._state().state != E0:
             async for pause in self._reach_state(
                 talk, StateCode.E0, lambda now: now.state == E0
             ):
                 yield pause
+        self._charger.owes = None
 
     async def _give_back(self, talk: Talk) -> Turns:
         """End the state that we brought about; a lost exchange is tried again."""
@@ -153,10 +173,13 @@ class Dialogue:
             if debt is None:
                 return
             with suppress(ExchangeError):
-                if (await charger.look(talk)).state == debt.state:
+                if debt.is_open((await charger.look(talk)).state):
+                    if self._state().state == E0:
+                        async for pause in self._limit_first(talk):
+                            yield pause
                     await self._say(talk, debt.end)
                     await charger.look(talk)
-                if self._state().state != debt.state:
+                if not debt.is_open(self._state().state):
                     charger.owes = None
                     return
             yield self.pauses.verify

@@ -49,8 +49,8 @@ class SetUp(Dialogue):
         if new != old:
             async for pause in self._make_sure_free(talk, new):
                 yield pause
-        back = StateCode.E0 if before.state == E0 else StateCode.A1
-        charger.owes = Debt(E2, back)
+        was_disabled = before.state == E0
+        charger.owes = Debt(StateCode.E0) if was_disabled else Debt(StateCode.A1, E2)
         try:
             async for pause in self._write(talk, settings, new):
                 yield pause
@@ -63,9 +63,8 @@ class SetUp(Dialogue):
         charger.forget()
         async for pause in self._move(talk, new, serial):
             yield pause
-        async for pause in self._after_reset(talk, was_disabled=before.state == E0):
+        async for pause in self._after_reset(talk, was_disabled=was_disabled):
             yield pause
-        charger.owes = None
         await charger.read_flags(talk)
         self._check_settings(settings)
 

@@ -1,0 +1,162 @@
+"""What a command leaves half done, when the port is lost or the user says more."""
+
+import asyncio
+
+import pytest
+
+from custom_components.evse_bus.evse.abl.charger import AblCharger
+from custom_components.evse_bus.evse.model import (
+    Command,
+    EvseError,
+    OrderChange,
+)
+from tests.virtual import AblBox, Car, Request
+
+from .scene import LIMIT, STATE, Scene, box_with, config, orders, sleepy, until
+
+RESET, A1, E0 = 0x5A5A, 0xA1A1, 0xE0E0
+PAUSE = 1000
+
+pytestmark = pytest.mark.usefixtures("short_pauses")
+
+
+async def cut_off_while_waking(scene: Scene, box: AblBox) -> AblCharger:
+    """Lose the port while a car is woken: the outlet is still disabled."""
+    charger = await scene.settled(config(), orders())
+    await until(lambda: box.state == "B2")
+    await scene.polled(charger)
+    waking = asyncio.create_task(charger.command(Command.WAKE))
+    await until(lambda: box.state == "E0")
+    scene.virtual.unplug()
+    with pytest.raises(EvseError):
+        await waking
+    return charger
+
+
+async def test_a_pause_said_meanwhile_stands_before_the_outlet_is_enabled() -> None:
+    box = box_with(sleepy())
+    async with Scene(box) as scene:
+        charger = await cut_off_while_waking(scene, box)
+        with pytest.raises(EvseError):
+            await charger.change_orders(OrderChange(allowed=False))
+        scene.virtual.replug()
+        await until(lambda: charger.owes is None)
+        await scene.polled(charger)
+        assert scene.writes() == [E0, PAUSE, A1]
+        assert box.state != "E0"
+
+
+async def test_an_outlet_disabled_by_the_user_meanwhile_stays_so() -> None:
+    box = box_with(sleepy())
+    async with Scene(box) as scene:
+        charger = await cut_off_while_waking(scene, box)
+        disabling = asyncio.Event()
+
+        def disable() -> None:
+            if scene.bus.connected and not disabling.is_set():
+                disabling.set()
+                # Let the command come before the first reading.
+                charger.slot.ready += 0.3
+                tasks.append(
+                    asyncio.create_task(
+                        charger.command(Command.SET_OUTLET, value=False)
+                    )
+                )
+
+        tasks: list[asyncio.Task[None]] = []
+        scene.bus.subscribe(disable)
+        scene.virtual.replug()
+        await disabling.wait()
+        await tasks[0]
+        await scene.polled(charger, 5)
+        assert box.state == "E0"
+        assert scene.writes() == [E0]
+
+
+async def reset_when_disabled(
+    scene: Scene, box: AblBox, charger: AblCharger, command: Command, value: object
+) -> None:
+    """Lose the port as soon as the box, its outlet disabled, has been reset."""
+    await charger.command(Command.SET_OUTLET, value=False)
+    resets = box.resets
+    resetting = asyncio.create_task(charger.command(command, value))  # type: ignore[arg-type]
+    await until(lambda: box.resets > resets)
+    scene.virtual.unplug()
+    with pytest.raises(EvseError):
+        await resetting
+    scene.virtual.replug()
+
+
+@pytest.mark.parametrize(
+    ("command", "value"),
+    [(Command.RESET, None), (Command.SET_UPSTREAM_TIMEOUT, True)],
+)
+async def test_an_outlet_is_disabled_again_though_the_reset_was_cut_off(
+    command: Command,
+    value: bool | None,  # noqa: FBT001
+) -> None:
+    box = box_with()
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders(10, allowed=False))
+        await reset_when_disabled(scene, box, charger, command, value)
+        await until(lambda: box.state == "E0")
+        await until(lambda: charger.owes is None)
+        await until(lambda: box.ic_amps == 0)
+
+
+async def test_after_a_reset_the_car_that_was_stopped_is_stopped_again() -> None:
+    car = Car(ramp=0.0, reaction=0.0)
+    car.plug_in()
+    box = box_with(car)
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders(10))
+        await reset_when_disabled(scene, box, charger, Command.RESET, None)
+        await until(lambda: box.state == "E0")
+        assert scene.writes(STATE) == [E0, RESET, E0]
+
+
+async def test_a_limit_not_taken_after_a_reset_leaves_no_outlet_enabled() -> None:
+    box = box_with()
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders(10))
+        await charger.command(Command.SET_OUTLET, value=False)
+        answer = box._answer
+
+        def refuse(request: Request) -> bytes | None:
+            if request.register == LIMIT and request.value is not None:
+                return b">0190046B\r\n"
+            return answer(request)
+
+        box._answer = refuse  # type: ignore[method-assign]
+        with pytest.raises(EvseError):
+            await charger.command(Command.RESET)
+        await until(lambda: box.state == "E0")
+
+
+async def test_an_outlet_enabled_by_the_user_after_a_reset_stays_so() -> None:
+    box = box_with()
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders(10))
+        await reset_when_disabled(scene, box, charger, Command.RESET, None)
+        await until(lambda: charger.owes is None and charger.available)
+        await charger.command(Command.SET_OUTLET, value=True)
+        await scene.polled(charger, 5)
+        assert box.state == "A1"
+
+
+async def test_a_box_that_stays_in_its_set_up_mode_is_led_out_of_it() -> None:
+    box = box_with()
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders(10))
+        answer = box._answer
+
+        def deaf_to_resets(request: Request) -> bytes | None:
+            if request.value == RESET:
+                return None
+            return answer(request)
+
+        box._answer = deaf_to_resets  # type: ignore[method-assign]
+        with pytest.raises(EvseError):
+            await charger.command(Command.SET_UPSTREAM_TIMEOUT, value=True)
+        await until(lambda: box.state == "A1")
+        assert scene.writes(STATE)[-1] == A1
