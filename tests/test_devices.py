@@ -116,3 +116,15 @@ async def test_the_second_module_makes_devices_of_both(hass: HomeAssistant) -> N
         await wait_for_state(hass, first, "0.0")
         assert entities.async_get(first).device_id != charger_id
         assert entry.subentries["evbox1923054"].subentry_type == SUBENTRY_CHARGER
+
+
+async def test_a_device_of_a_bus_that_is_not_running(hass: HomeAssistant) -> None:
+    """Nobody knows then what is still there: nothing is deleted, nothing fails."""
+    box = EvboxChargePoint(1923054, 2, min_interval=0)
+    async with running(hass, box, poll_interval=0.5) as (entry, _):
+        await get_entity(hass, "sensor", entry, "2_energy")
+        await hass.config_entries.async_unload(entry.entry_id)
+        child = dr.async_get(hass).async_get_child_device_by_identifier(
+            (DOMAIN, "evbox1923054_2"), "bus"
+        )
+        assert not await async_remove_config_entry_device(hass, entry, child)

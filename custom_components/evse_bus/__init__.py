@@ -5,6 +5,7 @@ A config entry is one bus (one port), each charger on it is a config subentry.
 
 from typing import Final
 
+from homeassistant.config_entries import ConfigEntryState
 from homeassistant.const import EVENT_HOMEASSISTANT_STOP, Platform
 from homeassistant.core import HomeAssistant
 from homeassistant.helpers import config_validation as cv
@@ -76,6 +77,9 @@ async def async_remove_config_entry_device(
     device: DeviceEntry | ChildDeviceEntry,
 ) -> bool:
     """Return whether a device may be deleted: only a connector that is gone."""
+    if entry.state is not ConfigEntryState.LOADED:
+        # Nobody knows what is still there.
+        return False
     return entry.runtime_data.forget_connector(
         {key for domain, key in device.identifiers if domain == DOMAIN}
     )
