@@ -28,7 +28,7 @@ class SlowCharger(SimulatedCharger):
         async def verify(talk: Talk) -> None:
             await self.say(talk, "V")
 
-        orders = self.careful(orders)
+        orders = self.target(change)
         await self.say(talk, "W", int(clamp(orders, self.limits).current))
         return Later(1.0, verify)
 
@@ -213,6 +213,24 @@ def test_a_pause_or_lowering_waits_for_no_change_under_way() -> None:
             assert writes(bus) == [20, 7, 0]
             await asyncio.gather(raising, *tasks)
             assert charger.orders.allowed is False
+
+    simulate(scene())
+
+
+def test_a_lowering_does_not_undo_the_start_it_has_overtaken() -> None:
+    async def scene() -> None:
+        async with Scene(interval=60.0) as bus:
+            charger = slow(bus)
+            await asyncio.sleep(1)
+            changes = (OrderChange(allowed=True), OrderChange(current=8.0))
+            tasks = []
+            for change in changes:
+                tasks.append(asyncio.create_task(charger.change_orders(change)))
+                await asyncio.sleep(0.3)
+            await asyncio.gather(*tasks)
+            assert writes(bus) == [10, 8]
+            assert charger.orders.limit.current == 8.0
+            assert charger.orders.allowed is True
 
     simulate(scene())
 

@@ -127,6 +127,7 @@ class Charger(ABC):
     ) -> Later[None] | None:
         """Make the charger follow these orders, through `clamp`; return when sure.
 
+        They are the `target` of the change, which may be another one in a later turn.
         ``change`` is what made these orders of those before: only where it says
         ``allowed=True`` has the user switched charging on just now; a box that is
         paused stays so after any other change. May take further turns.
@@ -247,21 +248,21 @@ class Charger(ABC):
 
     async def _impose_job(self, job: Job, talk: Talk) -> Later[None] | None:
         change = job.change or OrderChange()
-        target = self.careful(change.apply(self.orders))
-        return await self._imposed(target, await self.impose(talk, target, change))
+        result = await self.impose(talk, self.target(change), change)
+        return await self._imposed(change, result)
 
     async def _imposed(
-        self, target: Orders, result: Later[None] | None
+        self, change: OrderChange, result: Later[None] | None
     ) -> Later[None] | None:
-        """Let confirmed orders stand; until then, wait for what is to come later."""
+        """Let a confirmed change stand; until then, wait for what is to come later."""
         if result is not None:
             rest = result.step
 
             async def go_on(talk: Talk) -> Later[None] | None:
-                return await self._imposed(target, await rest(talk))
+                return await self._imposed(change, await rest(talk))
 
             return Later(result.pause, go_on)
-        stands = self.careful(target)
+        stands = self.target(change)
         changed = stands != self.orders
         self.orders = stands
         self.updated()
@@ -276,13 +277,14 @@ class Charger(ABC):
             # A full disk must not keep a pause from the wire.
             _LOGGER.exception("%s: orders were not stored", self.config.name)
 
-    def careful(self, orders: Orders) -> Orders:
-        """Return orders on their way, lowered to what the user has said since.
+    def target(self, change: OrderChange) -> Orders:
+        """Return the orders that a change on its way leads to, as of now.
 
-        A newer lowering stands from the moment it was said, whatever becomes of
-        the commands before it and of its own sending.
+        Others may have been confirmed since it set out. A newer lowering stands from
+        the moment it was said, whatever becomes of the commands before it and of its
+        own sending.
         """
-        return cautious(orders, self._wish)
+        return cautious(change.apply(self.orders), self._wish)
 
     def expire_orders(self, now: float) -> bool:
         """Note that the orders' lifetime is over; return whether it just ended."""

@@ -137,17 +137,16 @@ class AblCharger(AblReader):
                 await self.look(talk), setpoint, orders, change
             ):
                 return
-            wanted = partial(self._wanted, orders)
-            starts = change.allowed is True
-            async for pause in self.enforce(talk, wanted, starts=starts):
+            async for pause in self.enforce(
+                talk,
+                lambda: clamp(self.target(change), self.limits),
+                starts=change.allowed is True,
+            ):
                 yield pause
             self._limit_paused = setpoint.paused and orders.allowed is not False
             self._fell_back = False
         finally:
             self.end(token)
-
-    def _wanted(self, orders: Orders) -> Setpoint:
-        return clamp(self.careful(orders), self.limits)
 
     def _may_write(
         self, raw: Reading, setpoint: Setpoint, orders: Orders, change: OrderChange
