@@ -80,3 +80,21 @@ async def test_spare_the_main_fuse(hass: HomeAssistant) -> None:
             hass.states.async_set("sensor.main_current_l1", "24.5")
             await wait_for_state(hass, limit, "6.0")
             await bus.wait_for_async(lambda: box.ic_amps <= 6)
+
+
+async def test_the_main_fuse_is_spared_by_a_charger_that_was_away(
+    hass: HomeAssistant,
+) -> None:
+    box = AblBox(1)
+    async with running(hass, box, title="Carport") as (entry, bus):
+        limit = await get_entity(hass, "number", entry, "charging_current")
+        await call(hass, "number.set_value", limit, value=16)
+        hass.states.async_set("sensor.main_current_l1", "20")
+        async with automated(hass, "Spare the main fuse"):
+            bus.remove(box)
+            await wait_for_state(hass, limit, "unavailable")
+            hass.states.async_set("sensor.main_current_l1", "24.5")
+            await hass.async_block_till_done()
+            bus.add(box)
+            await wait_for_state(hass, limit, "6.0")
+            await bus.wait_for_async(lambda: box.ic_amps <= 6)

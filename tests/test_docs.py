@@ -5,6 +5,8 @@ from pathlib import Path
 import re
 import sys
 
+from custom_components.evse_bus.evse.protocols import PROTOCOLS
+from custom_components.evse_bus.flow_schema import default_of
 from tests.virtual import AblBox, Car, VirtualBus
 
 ROOT = Path(__file__).parents[1]
@@ -15,6 +17,17 @@ def script(page: str) -> str:
     """Return the one Python block of a page."""
     (block,) = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.DOTALL)
     return block
+
+
+def test_the_readme_knows_how_often_is_asked() -> None:
+    every = {
+        key: f"{default_of(PROTOCOLS[key], 'poll_interval'):g} s"
+        for key in ("evbox", "abl")
+    }
+    readme = " ".join((ROOT / "README.md").read_text().split())
+    assert f"EVBox {every['evbox']}, ABL {every['abl']}" in readme
+    assert f"an EVBox every {every['evbox']}" in readme
+    assert f"an ABL box every {every['abl']}" in readme
 
 
 async def test_the_script_of_the_library_reads_and_sets_a_charger() -> None:

@@ -7,7 +7,8 @@ import pytest
 from syrupy.assertion import SnapshotAssertion
 
 from custom_components.evse_bus.const import DOMAIN
-from tests.common import get_entity, running, wait_for_state, wait_until
+from custom_components.evse_bus.sensor_tables import BUS_SENSORS, CHARGER_STATISTICS
+from tests.common import call, get_entity, running, wait_for_state, wait_until
 from tests.virtual import AblBox, EvboxChargePoint
 from tests.virtual.device import Device
 
@@ -96,6 +97,33 @@ async def test_a_dead_charger_is_unavailable_and_the_others_are_not(
         assert hass.states.get(alive).state == "available"
         bus.add(two)
         await wait_for_state(hass, dead, "available")
+
+
+async def test_actions_on_a_dead_charger_are_skipped(hass: HomeAssistant) -> None:
+    """By Home Assistant itself, without an error; the README says so."""
+    box = AblBox(1)
+    async with running(hass, box) as (entry, bus):
+        limit = await get_entity(hass, "number", entry, "charging_current")
+        await call(hass, "number.set_value", limit, value=12)
+        bus.remove(box)
+        await wait_for_state(hass, limit, "unavailable")
+        await call(hass, "number.set_value", limit, value=8)
+        bus.add(box)
+        await wait_for_state(hass, limit, "12.0")
+
+
+async def test_counters_are_disabled_by_default(hass: HomeAssistant) -> None:
+    async with running(hass, AblBox(1)) as (entry, _):
+        await get_entity(hass, "sensor", entry, "1_status")
+        disabled = {
+            one.unique_id
+            for one in er.async_entries_for_config_entry(er.async_get(hass), "bus")
+            if one.disabled_by is er.RegistryEntryDisabler.INTEGRATION
+        }
+    assert disabled == {
+        *(f"bus_{one.key}" for one in BUS_SENSORS),
+        *(f"abl1_{one.key}" for one in CHARGER_STATISTICS),
+    }
 
 
 async def test_an_unplugged_adapter_and_back(

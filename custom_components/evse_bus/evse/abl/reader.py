@@ -87,6 +87,8 @@ _WITH_METER: Final = frozenset(
 class AblConfig(ChargerConfig):
     """What the user set up for one ABL wallbox."""
 
+    poll_interval: float = 2.0
+    """s: it falls asleep when idle, and forgets its limit with each power failure."""
     phase_order: Phases[int] = (1, 2, 3)
     """The phase that each of Ict1, Ict2, Ict3 measures; some boxes begin with L3."""
 
