@@ -235,6 +235,26 @@ def test_a_lowering_does_not_undo_the_start_it_has_overtaken() -> None:
     simulate(scene())
 
 
+def test_a_limit_merges_into_the_newest_that_waits() -> None:
+    async def scene() -> None:
+        async with Scene(interval=60.0) as bus:
+            await asyncio.sleep(1)
+            charger = bus.charger(1)
+            bus.line.devices[1].lose_next = 1
+            tasks = []
+            for current in (20.0, 8.0, 16.0):
+                change = OrderChange(current=current)
+                tasks.append(asyncio.create_task(charger.change_orders(change)))
+                # The first is on the wire when the second comes, and gets lost.
+                bus.line.devices[1].lose_next += current == 8.0
+                await asyncio.sleep(0.01 if current == 20.0 else 0.4)
+            await asyncio.gather(*tasks)
+            assert charger.orders.limit.current == 16.0
+            assert writes(bus)[-1] == 16
+
+    simulate(scene())
+
+
 def test_a_pause_that_is_said_again_does_not_overtake_the_start_after_it() -> None:
     async def scene() -> None:
         async with Scene(interval=60.0) as bus:

@@ -39,6 +39,8 @@ class Job(Slot):
     """A newer waiting job of this charger with the same key is merged into it."""
     change: OrderChange | None = None
     """The order change it carries; merged jobs carry both."""
+    raises: bool = False
+    """It asks for more than stood when it was said."""
     begun: bool = False
     """Its first turn is over; the rest must be finished even when we stop."""
     under_way: bool = False
@@ -47,15 +49,6 @@ class Job(Slot):
     future: asyncio.Future[object] = field(
         default_factory=lambda: asyncio.get_running_loop().create_future()
     )
-
-    @property
-    def raises(self) -> bool:
-        """Return whether it asks for more than stands."""
-        if self.charger is None or self.change is None or self.change.allowed is False:
-            return False
-        orders = self.charger.orders
-        # What it lowers has been lowered when it was said.
-        return self.change.allowed is True or self.change.apply(orders) != orders
 
 
 class JobQueue:
@@ -88,6 +81,7 @@ class JobQueue:
 
     def add(self, job: Job) -> None:
         """Let a job wait."""
+        job.raises = _raises(job)
         self._jobs.append(job)
 
     def merge(self, job: Job) -> Job | None:
@@ -98,15 +92,15 @@ class JobQueue:
         """
         if job.merge_key is None or job.change is None:
             return None
-        for waiting in self._jobs:
-            if (
-                waiting.charger is job.charger
-                and waiting.merge_key == job.merge_key
-                and waiting.change is not None
-                and not (waiting.begun or waiting.under_way)
-            ):
-                waiting.change = waiting.change.merged_with(job.change)
-                return waiting
+        for waiting in reversed(self._jobs):
+            if (waiting.charger, waiting.merge_key) != (job.charger, job.merge_key):
+                continue
+            if waiting.change is None or waiting.begun or waiting.under_way:
+                # Nor into an older one: this one's end would undo it.
+                return None
+            waiting.change = waiting.change.merged_with(job.change)
+            waiting.raises = _raises(waiting)
+            return waiting
         return None
 
     def supersede(self, charger: Charger, which: Callable[[OrderChange], bool]) -> None:
@@ -144,3 +138,12 @@ class JobQueue:
     def _remove(self, job: Job) -> None:
         if job in self._jobs:
             self._jobs.remove(job)
+
+
+def _raises(job: Job) -> bool:
+    """Return whether a change asks for more than stands; a pause never does."""
+    if job.charger is None or job.change is None or job.change.allowed is False:
+        return False
+    # What it lowers has been lowered in the orders already.
+    orders = job.charger.orders
+    return job.change.allowed is True or job.change.apply(orders) != orders
