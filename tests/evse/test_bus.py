@@ -487,10 +487,21 @@ def test_no_silence_no_speech() -> None:
 
             with pytest.raises(LineBusyError):
                 await bus.charger(1).run(ask)
+            pause = asyncio.create_task(
+                bus.charger(1).change_orders(OrderChange(allowed=False))
+            )
             await asyncio.sleep(10)
             assert len(bus.line.sent) == count
+            with pytest.raises(LineBusyError):
+                await pause
+            pause = asyncio.create_task(
+                bus.charger(1).change_orders(OrderChange(allowed=False))
+            )
+            await asyncio.sleep(1.2)
             stop.set()
             await talking
+            # Said while others talked, and sent as soon as they are quiet.
+            await pause
             await asyncio.sleep(5)
             assert len(bus.line.sent) > count
             assert bus.bus.wire.statistics.line_busy > 0

@@ -22,6 +22,7 @@ from .model import (
     EvseError,
     ExchangeRefusedError,
     ImplausibleReplyError,
+    LineBusyError,
     LineError,
     LineLostError,
     NotAvailableError,
@@ -306,7 +307,7 @@ class Bus:
         counted = job.charger.statistics if job.charger else ChargerStatistics()
         try:
             result = await job.step(Talk(self.wire, counted))
-        except ReplyTimeoutError as error:
+        except (ReplyTimeoutError, LineBusyError) as error:
             self._again_or_fail(job, error)
         except EvseError as error:
             counted.refused += isinstance(error, ExchangeRefusedError)
@@ -326,7 +327,7 @@ class Bus:
         finally:
             job.under_way = False
 
-    def _again_or_fail(self, job: Job, error: ReplyTimeoutError) -> None:
+    def _again_or_fail(self, job: Job, error: EvseError) -> None:
         timing = self.wire.timing
         if (
             job.persistence is Persistence.ONCE

@@ -47,8 +47,10 @@ class Wire:
     def exchange_time(self, request_bytes: int = _BASE_REQUEST) -> float:
         """Return the longest time an exchange can take, time-out included, s."""
         timing = self.timing
+        # Where silence is asked for, others may keep us waiting for it.
+        silence = timing.silence_patience if timing.silence else 0.0
         wire = (request_bytes + timing.longest_reply) * self.line.settings.byte_time
-        return timing.silence + wire + timing.reply_timeout + timing.gap
+        return silence + wire + timing.reply_timeout + timing.gap
 
     def reset(self) -> None:
         """Forget a frame begun: the line was opened anew."""

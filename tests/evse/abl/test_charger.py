@@ -202,8 +202,9 @@ async def test_a_box_exchanged_between_two_answers() -> None:
 async def test_a_second_box_with_the_same_id_is_noticed() -> None:
     async with Scene(AblBox(1, jitter=0.0)) as scene:
         charger = await scene.settled(config(), orders())
+        # A little after the first: on this quick wire an answer takes 0.9 ms.
         scene.virtual.add(
-            AblBox(1, serial="2W22xy99999999", turn_round=0.003, jitter=0.0)
+            AblBox(1, serial="2W22xy99999999", turn_round=0.0023, jitter=0.0)
         )
         await until(lambda: Fault.DUPLICATE_ADDRESS in charger.faults)
         scene.virtual.remove(scene.virtual.devices[-1])
