@@ -70,10 +70,11 @@ async def test_an_empty_bus_takes_twice_the_silence_of_each() -> None:
 
 
 @pytest.mark.usefixtures("few_ids")
-async def test_two_boxes_with_one_id() -> None:
+@pytest.mark.parametrize("later", [0.0003, 0.02], ids=["at once", "one by one"])
+async def test_two_boxes_with_one_id(later: float) -> None:
     boxes = (
         AblBox(1, serial="2W22xy00000001", jitter=0.0, turn_round=0.002),
-        AblBox(1, serial="2W22xy00000002", jitter=0.0, turn_round=0.003),
+        AblBox(1, serial="2W22xy00000002", jitter=0.0, turn_round=0.002 + later),
         box(2),
     )
     async with Scene(*boxes) as scene:
@@ -88,7 +89,7 @@ async def test_two_boxes_with_one_id() -> None:
 async def test_two_new_boxes_alone() -> None:
     boxes = (
         AblBox(1, serial="2W22xy00000001", jitter=0.0, turn_round=0.002),
-        AblBox(1, serial="2W22xy00000002", jitter=0.0, turn_round=0.003),
+        AblBox(1, serial="2W22xy00000002", jitter=0.0, turn_round=0.0023),
     )
     async with Scene(*boxes) as scene:
         assert await scan(scene) == ScanReport(duplicates=(1,))

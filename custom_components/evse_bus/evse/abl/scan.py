@@ -8,6 +8,7 @@ from typing import Final
 
 from ..bus import Bus
 from ..exchange import Talk
+from ..modbus import ModbusFrame
 from ..model import (
     ChargerConfig,
     ChargerInfo,
@@ -21,7 +22,15 @@ from ..model import (
 from ..protocol import Progress
 from .exchanges import read
 from .readings import charger_info
-from .registers import ADDRESSES, INFO, SERIAL, decode_info, decode_serial
+from .registers import (
+    ADDRESSES,
+    INFO,
+    SERIAL,
+    decode_info,
+    decode_serial,
+    read_answer,
+    read_request,
+)
 
 ASKED: Final = 2
 """A box asleep loses the first request, so every ID is asked twice."""
@@ -108,16 +117,42 @@ async def _ask_info(address: int, talk: Talk) -> ChargerInfo:
     """Return what a box at this address is.
 
     Two equal boxes may answer this as one; their serial numbers differ, so that
-    answer is then unreadable.
+    answer is then unreadable, or there are two. Raises GarbledReplyError for both.
     """
     info = decode_info(await read(talk, address, INFO))
-    try:
-        serial = decode_serial(await read(talk, address, SERIAL, attempts=2))
-    except GarbledReplyError:
-        raise
-    except ReplyTimeoutError:
-        serial = None
-    return charger_info(info, serial, None)
+    serials = await _listen_for_serials(talk, address)
+    if len(serials) > 1:
+        message = f"device-ID {address} has {len(serials)} serial numbers"
+        raise GarbledReplyError(message)
+    return charger_info(info, serials.pop() if serials else None, None)
+
+
+async def _listen_for_serials(talk: Talk, address: int) -> set[str | None]:
+    """Return every serial number told at an address; none: it has no such register.
+
+    Nothing is taken for the answer, so that a second box which is a little slower
+    than the first one is heard as well.
+    """
+    serials: set[str | None] = set()
+    answer = read_answer(address, SERIAL)
+
+    def collect(frame: ModbusFrame) -> None:
+        if (data := answer(frame)) is not None:
+            serials.add(decode_serial(data))
+
+    garbled: GarbledReplyError | None = None
+    for _ in range(ASKED):
+        try:
+            await talk.exchange(read_request(address, SERIAL), collect)
+        except GarbledReplyError as error:
+            garbled = error
+        except ReplyTimeoutError:
+            pass
+        if serials:
+            return serials
+    if garbled is not None:
+        raise garbled
+    return serials
 
 
 async def scan(
