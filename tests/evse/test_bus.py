@@ -583,6 +583,9 @@ def test_an_order_nobody_renews_becomes_the_fail_safe() -> None:
             assert charger.orders_expired
             assert charger.orders.limit.current == 16.0
             assert charger.setpoint.currents == (6.0, 6.0, 6.0)
+            await charger.change_orders(OrderChange(fail_safe_current=7.0))
+            assert charger.orders_expired
+            assert charger.setpoint.currents == (7.0, 7.0, 7.0)
             await charger.change_orders(OrderChange(current=16.0))
             assert charger.setpoint.currents == (16.0, 16.0, 16.0)
 

@@ -220,8 +220,9 @@ class Charger(ABC):
         """
         checked = check_change(change, self.limits)
         loop = asyncio.get_running_loop()
-        self._renewed = loop.time()
-        self.orders_expired = False
+        if _is_about_now(checked):
+            self._renewed = loop.time()
+            self.orders_expired = False
         self._wish = checked.apply(self._wish)
         lowered = cautious(self.orders, checked.apply(self.orders))
         if lowered != self.orders:
@@ -381,6 +382,12 @@ class Charger(ABC):
     def notice(self, fault: Fault, *, present: bool) -> None:
         """Set or clear a fault that we noticed ourselves."""
         self.noticed = self.noticed | {fault} if present else self.noticed - {fault}
+
+
+def _is_about_now(change: OrderChange) -> bool:
+    """Return whether a change says how to charge now, not just the fail-safe."""
+    said = (change.allowed, change.current, *change.phases)
+    return any(value is not None for value in said)
 
 
 def _merge_key(change: OrderChange) -> str | None:
