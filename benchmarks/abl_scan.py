@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Sequence
+from functools import partial
 from statistics import fmean, median
 
 from custom_components.evse_bus.evse.abl import PROTOCOL
@@ -12,6 +13,7 @@ from .setup import READING_REQUEST, abl_bus, settled, starts_of
 from .witness import Heard, Witness
 
 NAME = "abl-scan"
+_figure = partial(Figure, NAME)
 METHOD = """\
 16 virtual ABL boxes in a process of their own on a pty paced at 38400 8E1, poll
 interval 0, library alone. A period is the time between two reads of 0x002E of the
@@ -99,23 +101,3 @@ async def _watch(
 
 def _periods_of_first(log: Sequence[Heard]) -> list[float]:
     return gaps(starts_of(log, 1, READING_REQUEST))
-
-
-def _figure(  # noqa: PLR0913 - one line of the table
-    name: str,
-    value: float,
-    unit: str = "",
-    *,
-    digits: int = 1,
-    aim: float | None = None,
-    note: str = "",
-) -> Figure:
-    return Figure(
-        benchmark=NAME,
-        name=name,
-        value=value,
-        unit=unit,
-        digits=digits,
-        aim=aim,
-        note=note,
-    )

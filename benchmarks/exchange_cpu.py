@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+from functools import partial
 from statistics import median
 import time
 from unittest.mock import patch
@@ -19,6 +20,7 @@ from .responder import ABL, ABL_PIECES, MODBUS, MODBUS_PIECES, Responder
 from .setup import abl_bus, settled
 
 NAME = "exchange-cpu"
+_figure = partial(Figure, NAME, digits=0)
 METHOD = """\
 Processor time (user and system) of the whole process over N reads of 5 registers from
 0x002E, an answer of 31 bytes each, other values each time; the device is another
@@ -121,23 +123,3 @@ async def _tmodbus(url: str, line: LineSettings, unit: int, exchanges: int) -> f
     finally:
         with contextlib.suppress(OSError):
             await client.disconnect()
-
-
-def _figure(  # noqa: PLR0913 - one line of the table
-    name: str,
-    value: float,
-    unit: str = "",
-    *,
-    digits: int = 0,
-    aim: float | None = None,
-    note: str = "",
-) -> Figure:
-    return Figure(
-        benchmark=NAME,
-        name=name,
-        value=value,
-        unit=unit,
-        digits=digits,
-        aim=aim,
-        note=note,
-    )

@@ -1,12 +1,12 @@
 """Figures: statistics, the table a person reads, and results.json. Pure."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import KW_ONLY, asdict, dataclass
 from itertools import pairwise
 from typing import Any
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Figure:
     """One measured figure, with its aim where there is one."""
 
@@ -14,6 +14,7 @@ class Figure:
     name: str
     value: float
     unit: str = ""
+    _: KW_ONLY
     aim: float | None = None
     """The value must not be greater; ``None``: told for its own sake."""
     digits: int = 1

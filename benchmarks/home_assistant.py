@@ -1,6 +1,7 @@
 """(e) What a house with many chargers costs Home Assistant."""
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 from .figures import Figure, percentile
@@ -10,6 +11,7 @@ from .setup import ABL_LIMIT, EVBOX_LIMIT
 from .witness import Witness
 
 NAME = "home-assistant"
+_figure = partial(Figure, NAME)
 METHOD = f"""\
 One real Home Assistant ({LOADED}), started as its own runner does; measured idle,
 then after adding 16 ABL boxes and 8 EVBox ChargePoints of 20 modules (a car charging
@@ -142,23 +144,3 @@ def _p999(blocks: Mapping[str, Any]) -> float:
     # Only those above a millisecond are told one by one.
     short = blocks["callbacks"] - len(blocks["seconds"])
     return percentile([0.0] * short + blocks["seconds"], 0.999) * 1000
-
-
-def _figure(  # noqa: PLR0913 - one line of the table
-    name: str,
-    value: float,
-    unit: str = "",
-    *,
-    digits: int = 1,
-    aim: float | None = None,
-    note: str = "",
-) -> Figure:
-    return Figure(
-        benchmark=NAME,
-        name=name,
-        value=value,
-        unit=unit,
-        digits=digits,
-        aim=aim,
-        note=note,
-    )
