@@ -11,8 +11,8 @@ from tmodbus import create_async_ascii_client
 from tmodbus.transport import async_ascii
 
 from custom_components.evse_bus.evse.bus import Bus
+from custom_components.evse_bus.evse.errors import PortBusyError
 from custom_components.evse_bus.evse.framing import LineSettings
-from custom_components.evse_bus.evse.model import PortBusyError
 
 from .figures import Figure
 from .progress import say

@@ -12,11 +12,8 @@ from hypothesis import given, strategies as st
 import pytest
 
 from custom_components.evse_bus.const import DOMAIN
-from custom_components.evse_bus.evse.model import (
-    CurrentLimit,
-    Orders,
-    RefusedOrderError,
-)
+from custom_components.evse_bus.evse.errors import RefusedOrderError
+from custom_components.evse_bus.evse.model import CurrentLimit, Orders
 from custom_components.evse_bus.orders import OrderStore, decode, encode
 from tests.common import (
     call,

@@ -58,13 +58,14 @@ def test_the_library_stands_alone(path: Path) -> None:
     assert outside(path, EVSE) <= allowed
 
 
-def test_the_model_imports_nothing() -> None:
-    assert local(EVSE / "model.py", EVSE) == set()
-    assert outside(EVSE / "model.py", EVSE) <= set(sys.stdlib_module_names)
+@pytest.mark.parametrize("name", ["model", "errors"])
+def test_the_words_import_nothing(name: str) -> None:
+    assert local(EVSE / f"{name}.py", EVSE) == set()
+    assert outside(EVSE / f"{name}.py", EVSE) <= set(sys.stdlib_module_names)
 
 
 def test_the_clamp_and_the_schedule_are_pure() -> None:
-    assert local(EVSE / "safety.py", EVSE) == {"model"}
+    assert local(EVSE / "safety.py", EVSE) == {"errors", "model"}
     assert local(EVSE / "schedule.py", EVSE) == set()
     for name in ("safety", "schedule"):
         assert "asyncio" not in outside(EVSE / f"{name}.py", EVSE)

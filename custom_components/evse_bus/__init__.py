@@ -15,7 +15,7 @@ from homeassistant.helpers.typing import ConfigType
 from .const import DOMAIN
 from .coordinator import BusCoordinator, EvseBusConfigEntry
 from .errors import not_ready
-from .evse.model import LineError
+from .evse.errors import LineError
 from .orders import OrderStore
 
 CONFIG_SCHEMA = cv.config_entry_only_config_schema(DOMAIN)

@@ -25,7 +25,8 @@ from .const import (
     DOMAIN,
     SUBENTRY_CHARGER,
 )
-from .evse.model import RefusedOrderError, ScanReport
+from .evse.errors import RefusedOrderError
+from .evse.model import ScanReport
 from .evse.protocol import Progress, Protocol
 from .evse.protocols import PROTOCOLS
 from .flow_address import ADDRESSES, Errors, typed_addresses

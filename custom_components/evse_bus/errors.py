@@ -11,7 +11,7 @@ from homeassistant.exceptions import (
 )
 
 from .const import DOMAIN
-from .evse.model import (
+from .evse.errors import (
     DuplicateAddressError,
     EvseError,
     ExchangeRefusedError,

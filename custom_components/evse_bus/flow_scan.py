@@ -13,21 +13,18 @@ from .const import (
     CONF_INSTALLATION_LIMIT,
     LOGGER,
 )
-from .evse.line import Line
-from .evse.model import (
-    ChargerConfig,
-    CurrentLimit,
+from .evse.errors import (
     LineBusyError,
     LineError,
     LineLostError,
     NotAvailableError,
-    Orders,
     PortBusyError,
     PortMissingError,
     PortPermissionError,
     PortSettingsError,
-    ScanReport,
 )
+from .evse.line import Line
+from .evse.model import ChargerConfig, CurrentLimit, Orders, ScanReport
 from .flow_schema import CONF_SEARCH_CURRENT
 
 if TYPE_CHECKING:

@@ -33,7 +33,8 @@ from .const import (
     CONF_PROTOCOL,
     CONF_STOP_BITS,
 )
-from .evse.model import MAXIMUM_CURRENT, MINIMUM_CURRENT, RefusedOrderError
+from .evse.errors import RefusedOrderError
+from .evse.model import MAXIMUM_CURRENT, MINIMUM_CURRENT
 from .evse.protocols import PROTOCOLS
 from .evse.safety import INTERVALS_PER_TIMEOUT, MAXIMUM_TIMEOUT, number
 from .flow_address import ADDRESSES, Errors

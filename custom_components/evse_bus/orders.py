@@ -16,7 +16,8 @@ from homeassistant.util.file import WriteError
 from homeassistant.util.json import SerializationError
 
 from .const import DOMAIN, LOGGER
-from .evse.model import CurrentLimit, Orders, Phases, RefusedOrderError
+from .evse.errors import RefusedOrderError
+from .evse.model import CurrentLimit, Orders, Phases
 from .evse.safety import cautious, number
 
 STORAGE_VERSION: Final = 1

@@ -20,7 +20,8 @@ from .const import (
     CONF_SERIAL,
     SUBENTRY_CHARGER,
 )
-from .evse.model import NotAvailableError, ScanReport
+from .evse.errors import NotAvailableError
+from .evse.model import ScanReport
 from .flow_address import ADDRESSES, Errors, typed_addresses
 from .flow_charger import (
     charger_data,

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Self, override
 
 from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.charger import Charger
+from custom_components.evse_bus.evse.errors import LineLostError
 from custom_components.evse_bus.evse.exchange import Talk
 from custom_components.evse_bus.evse.framing import (
     Frame,
@@ -19,7 +20,7 @@ from custom_components.evse_bus.evse.framing import (
     LineSettings,
     Timing,
 )
-from custom_components.evse_bus.evse.jobs import Later, Step
+from custom_components.evse_bus.evse.jobs import Later
 from custom_components.evse_bus.evse.line import Line
 from custom_components.evse_bus.evse.model import (
     Capability,
@@ -27,7 +28,6 @@ from custom_components.evse_bus.evse.model import (
     ChargerReading,
     CurrentLimit,
     Limits,
-    LineLostError,
     OrderChange,
     Orders,
 )
@@ -282,7 +282,7 @@ class SimulatedCharger(Charger):
         await self.say(talk, "W", int(clamp(orders, self.limits).current))
 
     @override
-    def on_unsolicited(self, frame: Frame) -> Step[None] | None:
+    def on_unsolicited(self, frame: Frame) -> Later[None] | None:
         if (
             isinstance(frame, Telegram)
             and frame.address == self.config.address
@@ -293,7 +293,7 @@ class SimulatedCharger(Charger):
                 self.asked.append(frame.value)
                 await self.say(talk, "!", frame.value)
 
-            return answer
+            return Later(0.0, answer)
         return None
 
 

@@ -8,19 +8,18 @@ from math import isclose
 from hypothesis import given, settings, strategies as st
 import pytest
 
-from custom_components.evse_bus.evse.exchange import Talk
-from custom_components.evse_bus.evse.jobs import Later
-from custom_components.evse_bus.evse.model import (
+from custom_components.evse_bus.evse.errors import (
     GarbledReplyError,
     LineBusyError,
     LineLostError,
     NotAvailableError,
-    OrderChange,
-    Persistence,
     PortMissingError,
     ReplyTimeoutError,
     SupersededError,
 )
+from custom_components.evse_bus.evse.exchange import Talk
+from custom_components.evse_bus.evse.jobs import Later
+from custom_components.evse_bus.evse.model import OrderChange, Persistence
 
 from .simulated import TIMING, Device, Scene, SimulatedLine, now, simulate
 

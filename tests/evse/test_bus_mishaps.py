@@ -5,14 +5,10 @@ from typing import override
 
 import pytest
 
+from custom_components.evse_bus.evse.errors import LineLostError, NotAvailableError
 from custom_components.evse_bus.evse.exchange import Talk
 from custom_components.evse_bus.evse.jobs import Later
-from custom_components.evse_bus.evse.model import (
-    LineLostError,
-    NotAvailableError,
-    OrderChange,
-    Orders,
-)
+from custom_components.evse_bus.evse.model import OrderChange, Orders
 from custom_components.evse_bus.evse.safety import clamp
 
 from .simulated import Scene, SimulatedCharger, SimulatedLine, simulate

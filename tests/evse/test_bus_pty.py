@@ -7,12 +7,8 @@ import pytest
 
 from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.charger import Charger
-from custom_components.evse_bus.evse.model import (
-    CurrentLimit,
-    LineLostError,
-    OrderChange,
-    Orders,
-)
+from custom_components.evse_bus.evse.errors import LineLostError
+from custom_components.evse_bus.evse.model import CurrentLimit, OrderChange, Orders
 from custom_components.evse_bus.evse.protocols import PROTOCOLS
 from tests.virtual import AblBox, Request, VirtualBus, requests_in
 

@@ -13,9 +13,7 @@ import tty
 from hypothesis import given, strategies as st
 import pytest
 
-from custom_components.evse_bus.evse.framing import LineSettings
-from custom_components.evse_bus.evse.line import Line, line_error
-from custom_components.evse_bus.evse.model import (
+from custom_components.evse_bus.evse.errors import (
     LineError,
     LineLostError,
     PortBusyError,
@@ -23,6 +21,8 @@ from custom_components.evse_bus.evse.model import (
     PortPermissionError,
     PortSettingsError,
 )
+from custom_components.evse_bus.evse.framing import LineSettings
+from custom_components.evse_bus.evse.line import Line, line_error
 
 SETTINGS = LineSettings(baudrate=38400)
 

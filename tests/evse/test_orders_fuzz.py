@@ -8,7 +8,8 @@ from random import Random
 from hypothesis import given, settings, strategies as st
 import pytest
 
-from custom_components.evse_bus.evse.model import EvseError, OrderChange
+from custom_components.evse_bus.evse.errors import EvseError
+from custom_components.evse_bus.evse.model import OrderChange
 
 from .simulated import Scene, SimulatedCharger, simulate
 from .test_bus_mishaps import SlowCharger

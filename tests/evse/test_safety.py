@@ -8,6 +8,7 @@ from pathlib import Path
 from hypothesis import assume, given, strategies as st
 import pytest
 
+from custom_components.evse_bus.evse.errors import RefusedOrderError
 from custom_components.evse_bus.evse.model import (
     MINIMUM_CURRENT,
     UNKNOWN_PHASES,
@@ -15,7 +16,6 @@ from custom_components.evse_bus.evse.model import (
     Limits,
     OrderChange,
     Orders,
-    RefusedOrderError,
 )
 from custom_components.evse_bus.evse.safety import (
     MAXIMUM_TIMEOUT,

@@ -12,26 +12,24 @@ import logging
 from math import inf
 from typing import Final, Self
 
+from .alarm import Alarm
 from .charger import Charger
+from .duty import Duty
+from .errors import (
+    EvseError,
+    ImplausibleReplyError,
+    LineError,
+    LineLostError,
+    NotAvailableError,
+)
 from .exchange import Talk, Wire
 from .framing import Frame, Framer, Timing
 from .jobs import Job, JobQueue, Later, Step
 from .line import Line
 from .listeners import tell
-from .model import (
-    EvseError,
-    ExchangeRefusedError,
-    ImplausibleReplyError,
-    LineBusyError,
-    LineError,
-    LineLostError,
-    NotAvailableError,
-    OrderChange,
-    Persistence,
-    ReplyTimeoutError,
-)
+from .model import OrderChange, Persistence
 from .schedule import Kind, Slot, choose
-from .statistics import ChargerStatistics
+from .serving import serve
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -47,7 +45,13 @@ class Bus:
     """All chargers of one line, and the line."""
 
     def __init__(
-        self, line: Line, framer: Framer[Frame], timing: Timing, name: str = ""
+        self,
+        line: Line,
+        framer: Framer[Frame],
+        timing: Timing,
+        name: str = "",
+        *,
+        duty: Duty | None = None,
     ) -> None:
         """Put chargers on with `add`, then `start`."""
         self.line = line
@@ -60,12 +64,15 @@ class Bus:
         self._jobs = JobQueue()
         self._task: asyncio.Task[None] | None = None
         self._stopping = False
-        self._wake: asyncio.Future[None] | None = None
+        self._alarm = Alarm()
         self._turn_of: Slot | None = None
         self._turn_over = asyncio.Event()
         self._last_probe = -inf
         self._listeners: list[Callable[[], None]] = []
         line.on_lost = self._on_lost
+        self.duty = duty
+        if duty is not None:
+            duty.bus = self
 
     # -- Life --------------------------------------------------------------------
 
@@ -167,6 +174,8 @@ class Bus:
         if not self.connected:
             message = f"{self.name} is not connected"
             raise LineLostError(message)
+        if self.duty is not None and self.duty.refusal is not None:
+            raise NotAvailableError(self.duty.refusal)
         if (waiting := self._jobs.merge(job)) is not None:
             self.wire.statistics.merged += 1
             job = waiting
@@ -194,6 +203,10 @@ class Bus:
         """Drop waiting order changes that a newer command makes wrong."""
         self._jobs.supersede(charger, which)
 
+    def look_again(self) -> None:
+        """Choose anew who speaks next: something has changed."""
+        self._alarm.ring()
+
     def worst_case(self, charger: Charger) -> float:
         """Return the longest time one turn of a charger can take, s."""
         return charger.exchanges_per_turn * self.wire.exchange_time(
@@ -215,7 +228,7 @@ class Bus:
                 choice = choose(slots, loop.time(), self._last_probe)
                 slot = choice.slot
                 if slot is None:
-                    await self._sleep_until(choice.wake_at)
+                    await self._alarm.sleep_until(choice.wake_at)
                     continue
                 self.wire.statistics.for_deadline += choice.for_deadline
                 await self._serve(slot)
@@ -238,11 +251,18 @@ class Bus:
     def _slots(self) -> list[Slot]:
         if self._stopping:
             return [job for job in self._jobs if job.begun]
+        if self.duty is not None and self.duty.silent:
+            return [self.duty.slot]
         slots: list[Slot] = [charger.slot for charger in self.chargers.values()]
         slots.extend(self._jobs.eligible())
+        if self.duty is not None:
+            slots.append(self.duty.slot)
         return slots
 
     async def _turn(self, slot: Slot, now: float) -> None:
+        if self.duty is not None and slot is self.duty.slot:
+            await self._duty_turn(self.duty, now)
+            return
         if slot.kind is Kind.PROBE:
             self._last_probe = now
         if isinstance(slot, Job):
@@ -253,10 +273,25 @@ class Bus:
             charger.statistics.missed_deadlines += 1
             self.wire.statistics.missed_deadlines += 1
         if isinstance(slot, Job):
-            await self._job_turn(slot)
+            await serve(slot, self.wire, self._jobs, connected=lambda: self.connected)
         elif charger is not None:
             await self._poll_turn(charger)
         self._respect_minimum(charger)
+
+    async def _duty_turn(self, duty: Duty, now: float) -> None:
+        late = now > duty.slot.start_by
+        duty.statistics.missed_deadlines += late
+        self.wire.statistics.missed_deadlines += late
+        duty.slot.served = now
+        try:
+            await duty.turn(Talk(self.wire, duty.statistics))
+        except EvseError as error:
+            _LOGGER.debug("%s: %s", self.name, error)
+            duty.failed(asyncio.get_running_loop().time())
+        except Exception:
+            # A mistake of ours must not end the bus for everybody else.
+            _LOGGER.exception("%s: its own turn failed unforeseen", self.name)
+            duty.failed(asyncio.get_running_loop().time())
 
     async def _poll_turn(self, charger: Charger) -> None:
         loop = asyncio.get_running_loop()
@@ -298,47 +333,6 @@ class Bus:
         patience = self.wire.timing.silence_patience
         charger.slot.ready = now + max(patience, charger.minimum_pause(now))
 
-    async def _job_turn(self, job: Job) -> None:
-        if job.future.cancelled():
-            self._jobs.fail(job, NotAvailableError("nobody waits for it"))
-            return
-        job.tries += 1
-        job.under_way = True
-        counted = job.charger.statistics if job.charger else ChargerStatistics()
-        try:
-            result = await job.step(Talk(self.wire, counted))
-        except (ReplyTimeoutError, LineBusyError) as error:
-            self._again_or_fail(job, error)
-        except EvseError as error:
-            counted.refused += isinstance(error, ExchangeRefusedError)
-            self._jobs.fail(job, error)
-        except Exception as error:
-            # A mistake of ours must not end the bus for everybody else.
-            _LOGGER.exception("%s: a command failed unforeseen", self.name)
-            self._jobs.fail(job, EvseError(f"{type(error).__name__}: {error}"))
-        else:
-            if isinstance(result, Later):
-                job.step = result.step
-                job.ready = asyncio.get_running_loop().time() + result.pause
-                job.begun = True
-                job.tries = 0
-            else:
-                self._jobs.done(job, result)
-        finally:
-            job.under_way = False
-
-    def _again_or_fail(self, job: Job, error: EvseError) -> None:
-        timing = self.wire.timing
-        if (
-            job.persistence is Persistence.ONCE
-            or job.tries >= timing.attempts
-            or not self.connected
-        ):
-            self._jobs.fail(job, error)
-            return
-        self.wire.statistics.retries += 1
-        job.ready = asyncio.get_running_loop().time() + timing.retry_pauses[0]
-
     def _follow_up(
         self, charger: Charger, later: Later[None], persistence: Persistence
     ) -> None:
@@ -350,7 +344,7 @@ class Bus:
                 kind=Kind.PAUSE,
                 ready=now + later.pause,
                 due=now,
-                worst_case=self.worst_case(charger),
+                worst_case=later.worst_case or self.worst_case(charger),
                 step=later.step,
                 persistence=persistence,
             )
@@ -365,13 +359,17 @@ class Bus:
         earliest = now + charger.minimum_pause(now)
         charger.slot.ready = max(charger.slot.ready, earliest)
         for job in self._jobs:
-            if job.charger is charger:
+            if job.charger is charger and not (
+                charger.pauses_hurry and job.kind is Kind.PAUSE
+            ):
                 job.ready = max(job.ready, earliest)
 
     def _on_unasked(self, frame: Frame) -> bool:
+        if self.duty is not None and self.duty.heard(frame):
+            return True
         for charger in tuple(self.chargers.values()):
-            if (step := charger.on_unsolicited(frame)) is not None:
-                self._follow_up(charger, Later(0.0, step), Persistence.ONCE)
+            if (later := charger.on_unsolicited(frame)) is not None:
+                self._follow_up(charger, later, Persistence.ONCE)
                 return True
         return False
 
@@ -385,6 +383,8 @@ class Bus:
             charger.on_line_open()
             # It may have heard us a moment ago, before the line was lost.
             charger.slot.ready = now + charger.minimum_pause(now)
+        if self.duty is not None:
+            self.duty.on_line_open(now)
         self._tell()
 
     def _on_lost(self, error: LineLostError) -> None:
@@ -392,18 +392,29 @@ class Bus:
         self.connected = False
         self.wire.fail(error)
         self._jobs.fail_all(error)
+        if self.duty is not None:
+            self.duty.slot.start_by = inf
+        self._abandon_chargers()
+        self._tell()
+        self.look_again()
+
+    def hush(self, why: str) -> None:
+        """Let nobody speak: what waits fails, and no reading is believed any more."""
+        self._jobs.fail_all(NotAvailableError(why))
+        self._abandon_chargers()
+        self.look_again()
+
+    def _abandon_chargers(self) -> None:
         for charger in self.chargers.values():
             charger.slot.start_by = inf
             charger.set_unavailable()
-        self._tell()
-        self.look_again()
 
     async def _reopen(self) -> bool:
         """Open the port again, however long it takes; False when told to stop."""
         pause = REOPEN_FIRST
         while True:
             if not self._stopping:
-                await self._sleep_until(asyncio.get_running_loop().time() + pause)
+                await self._alarm.sleep_until(asyncio.get_running_loop().time() + pause)
             if self._stopping:
                 return False
             try:
@@ -419,26 +430,6 @@ class Bus:
 
     def _tell(self) -> None:
         tell(self._listeners)
-
-    # -- Sleeping and waking -----------------------------------------------------
-
-    async def _sleep_until(self, wake_at: float) -> None:
-        loop = asyncio.get_running_loop()
-        self._wake = loop.create_future()
-        handle = None
-        if wake_at < inf:
-            handle = loop.call_at(wake_at, self.look_again)
-        try:
-            await self._wake
-        finally:
-            self._wake = None
-            if handle is not None:
-                handle.cancel()
-
-    def look_again(self) -> None:
-        """Choose anew who speaks next: something has changed."""
-        if self._wake is not None and not self._wake.done():
-            self._wake.set_result(None)
 
 
 def _belongs(slot: Slot, charger: Charger) -> bool:

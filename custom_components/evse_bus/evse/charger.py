@@ -12,12 +12,13 @@ that they hold for every protocol alike:
 
 from abc import ABC, abstractmethod
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from functools import partial
 import logging
 from math import inf
 from typing import TYPE_CHECKING, ClassVar
 
+from .errors import NotAvailableError
 from .exchange import Talk
 from .framing import Frame, Timing
 from .jobs import Job, Later, Step
@@ -30,10 +31,11 @@ from .model import (
     Command,
     Fault,
     Limits,
-    NotAvailableError,
     OrderChange,
     Orders,
     Persistence,
+    Range,
+    Setting,
 )
 from .safety import Setpoint, cautious, check_change, clamp, expired
 from .schedule import Kind, Slot
@@ -51,6 +53,8 @@ class Charger(ABC):
     timing: ClassVar[Timing]
     orders_keep_alive: ClassVar[bool] = False
     """Imposing orders meets the deadline of the regular exchange as well."""
+    pauses_hurry: ClassVar[bool] = False
+    """A pause does not wait for the end of the minimum interval."""
 
     def __init__(self, config: ChargerConfig, orders: Orders) -> None:
         """Take the orders that stand; nothing is sent before the bus starts."""
@@ -146,9 +150,15 @@ class Charger(ABC):
         """Return how many exchanges one turn may hold at most."""
         return 1
 
-    def on_unsolicited(self, frame: Frame) -> Step[None] | None:  # noqa: ARG002
+    def on_unsolicited(self, frame: Frame) -> Later[None] | None:  # noqa: ARG002
         """Return an urgent turn for a frame nobody asked for; ``None``: not mine."""
         return None
+
+    async def farewell(self) -> None:  # noqa: B027 - most have nothing to say
+        """Say what is to be said when everything stops; orders stay as they are.
+
+        Raises what `run` raises.
+        """
 
     @abstractmethod
     def on_line_open(self) -> None:
@@ -262,7 +272,7 @@ class Charger(ABC):
             async def go_on(talk: Talk) -> Later[None] | None:
                 return await self._imposed(change, await rest(talk))
 
-            return Later(result.pause, go_on)
+            return Later(result.pause, go_on, result.worst_case)
         stands = self.target(change)
         changed = stands != self.orders
         self.orders = stands
@@ -312,7 +322,7 @@ class Charger(ABC):
     async def command(
         self,
         command: Command,
-        value: bool | int | None = None,  # noqa: FBT001
+        value: bool | int | str | None = None,  # noqa: FBT001
     ) -> None:
         """Carry out a command; return when it is known to have worked.
 
@@ -320,6 +330,21 @@ class Charger(ABC):
         `change_orders` raises.
         """
         message = f"{self.config.name} knows no command {command}: {value}"
+        raise NotAvailableError(message)
+
+    @property
+    def settings(self) -> Mapping[Setting, Range]:
+        """Return what can be set in the charger's own memory, and how far."""
+        return {}
+
+    async def configure(self, setting: Setting, value: int) -> None:
+        """Set something in the charger's own memory; return when it is read back.
+
+        Such a memory wears out: this is for people, not for automations. Raises
+        NotAvailableError where the charger has no such setting, RefusedOrderError
+        for a value out of its range, NotConfirmedError, and what `run` raises.
+        """
+        message = f"{self.config.name} has no setting {setting}: {value}"
         raise NotAvailableError(message)
 
     async def run[T](

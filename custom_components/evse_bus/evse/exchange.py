@@ -8,15 +8,15 @@ from collections.abc import Callable
 from math import inf
 from typing import Final
 
-from .framing import Frame, Framer, Timing
-from .line import Line
-from .model import (
+from .errors import (
     EvseError,
     GarbledReplyError,
     LineBusyError,
     LineLostError,
     ReplyTimeoutError,
 )
+from .framing import Frame, Framer, Timing
+from .line import Line
 from .statistics import BusStatistics, ChargerStatistics, Direction, FrameLog
 
 _BASE_REQUEST: Final = 64
@@ -51,6 +51,11 @@ class Wire:
         silence = timing.silence_patience if timing.silence else 0.0
         wire = (request_bytes + timing.longest_reply) * self.line.settings.byte_time
         return silence + wire + timing.reply_timeout + timing.gap
+
+    def send_time(self, request_bytes: int) -> float:
+        """Return the longest time it can take to send what nobody answers, s."""
+        silence = self.timing.silence_patience if self.timing.silence else 0.0
+        return silence + request_bytes * self.line.settings.byte_time
 
     def reset(self) -> None:
         """Forget a frame begun: the line was opened anew."""
@@ -113,6 +118,20 @@ class Wire:
             message = f"{self.line.url} was lost"
             raise LineLostError(message)
         return result  # type: ignore[return-value] # accept's own type
+
+    async def send(self, request: Request) -> float:
+        """Send what nobody answers (see `Talk.send`)."""
+        self.sent_at = None
+        await self._silence()
+        data = request() if callable(request) else request
+        self._framer.reset()
+        sent = self.line.write(data)
+        self.sent_at = sent
+        self.frames.add(Direction.OUT, data)
+        self.statistics.sent_only += 1
+        # The line is ours until the last byte has left.
+        await asyncio.sleep(sent - asyncio.get_running_loop().time())
+        return sent
 
     async def _silence(self) -> None:
         """Wait until the line has been quiet for as long as the protocol asks."""
@@ -194,6 +213,15 @@ class Talk:
         return await self._wire.exchange(
             request, accept, self._counted, reply_may_equal=reply_may_equal
         )
+
+    async def send(self, request: Request) -> float:
+        """Send what nobody answers; return the loop time at which it had left.
+
+        For a broadcast and for the answer to somebody's request. A function is asked
+        for the bytes when the line is quiet, right before they go. Raises
+        LineBusyError and LineLostError.
+        """
+        return await self._wire.send(request)
 
 
 class _PendingReply:

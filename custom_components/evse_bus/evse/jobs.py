@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 import logging
 from typing import TYPE_CHECKING
 
+from .errors import EvseError, SupersededError
 from .exchange import Talk
-from .model import EvseError, OrderChange, Persistence, SupersededError
+from .model import OrderChange, Persistence
 from .schedule import Slot
 
 if TYPE_CHECKING:
@@ -26,6 +27,8 @@ class Later[T]:
     pause: float
     """s"""
     step: Step[T]
+    worst_case: float | None = None
+    """Longest time its next turn can take, s; ``None``: as any turn of its charger."""
 
 
 @dataclass(slots=True, eq=False, kw_only=True)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, override
 
 from serialx import Parity, SerialException, StopBits, create_serial_connection
 
-from .model import (
+from .errors import (
     LineError,
     LineLostError,
     PortBusyError,

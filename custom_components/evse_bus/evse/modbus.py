@@ -1,8 +1,9 @@
 """Modbus frames, found and checked by us; contents and checksums by pymodbus.
 
 Finding frames is ours because the dialects on these buses break the rules that
-pymodbus' and other frame splitters rely on (ABL answers with ``>``), and because a
-good frame behind a broken one must not be lost. pymodbus gives what needs no port:
+pymodbus' and other frame splitters rely on (ABL answers with ``>``, a SmartEVSE
+leaves the 0x80 out of its exceptions), and because a good frame behind a broken one
+must not be lost. pymodbus gives what needs no port:
 the request contents (PDU) and the checksum.
 """
 
@@ -11,15 +12,19 @@ from dataclasses import dataclass
 import re
 from typing import Final, override
 
-from pymodbus.framer import FramerAscii
+from pymodbus.framer import FramerAscii, FramerRTU
 from pymodbus.pdu.register_message import (
     ReadHoldingRegistersRequest,
+    ReadInputRegistersRequest,
     WriteMultipleRegistersRequest,
+    WriteSingleRegisterRequest,
 )
 
 from .framing import Frame, Framer
 
 READ_HOLDING_REGISTERS: Final = 0x03
+READ_INPUT_REGISTERS: Final = 0x04
+WRITE_SINGLE_REGISTER: Final = 0x06
 WRITE_MULTIPLE_REGISTERS: Final = 0x10
 EXCEPTION: Final = 0x80
 """Added to the function of a request that is refused."""
@@ -38,8 +43,10 @@ class ModbusFrame(Frame):
     """One frame with a good checksum."""
 
     raw: bytes
-    is_reply: bool
-    """It began with the sign of an answer; otherwise it is somebody's request."""
+    is_reply: bool | None
+    """It began with the sign of an answer; otherwise it is somebody's request.
+
+    ``None``: RTU has no such sign."""
     unit: int
     function: int
     data: bytes
@@ -67,16 +74,33 @@ def read_registers(register: int, count: int) -> bytes:
     return bytes((request.function_code,)) + request.encode()
 
 
+def read_input_registers(register: int, count: int) -> bytes:
+    """Return the PDU that reads input registers (function 0x04).
+
+    Raises ValueError when there are no such registers.
+    """
+    request = ReadInputRegistersRequest(address=register, count=count)
+    return bytes((request.function_code,)) + request.encode()
+
+
+def write_register(register: int, value: int) -> bytes:
+    """Return the PDU that writes one register with function 0x06."""
+    request = WriteSingleRegisterRequest(address=register, registers=[value])
+    return bytes((request.function_code,)) + request.encode()
+
+
 def write_registers(register: int, values: Sequence[int]) -> bytes:
     """Return the PDU that writes holding registers with function 0x10."""
     request = WriteMultipleRegistersRequest(address=register, registers=list(values))
     return bytes((request.function_code,)) + request.encode()
 
 
-def registers_read(frame: ModbusFrame, count: int) -> bytes | None:
+def registers_read(
+    frame: ModbusFrame, count: int, function: int = READ_HOLDING_REGISTERS
+) -> bytes | None:
     """Return the bytes of so many registers, ``None`` if it does not hold them."""
     length = 2 * count
-    if frame.function != READ_HOLDING_REGISTERS or len(frame.data) != 1 + length:
+    if frame.function != function or len(frame.data) != 1 + length:
         return None
     return frame.data[1:] if frame.data[0] == length else None
 
@@ -90,6 +114,16 @@ def is_written(frame: ModbusFrame, register: int, count: int) -> bool:
 def exception_code(frame: ModbusFrame, function: int) -> int | None:
     """Return the code with which a request was refused, ``None`` if it was not."""
     if frame.function != function | EXCEPTION or len(frame.data) != 1:
+        return None
+    return frame.data[0]
+
+
+def malformed_exception_code(frame: ModbusFrame, function: int) -> int | None:
+    """Return the code of an exception without the 0x80 (SmartEVSE), if it is one.
+
+    No good answer to any function here has one byte of contents (PROTOCOLS.md, 3).
+    """
+    if frame.function != function or len(frame.data) != 1:
         return None
     return frame.data[0]
 
@@ -156,3 +190,128 @@ def _decode(raw: bytes, digits: bytes) -> ModbusFrame | None:
         function=content[1],
         data=content[2:-1],
     )
+
+
+# -- RTU -------------------------------------------------------------------------
+
+_RTU_CHECKSUM: Final = 2
+_RTU_EXCEPTION: Final = 5
+_RTU_FIXED: Final = 8
+"""Bytes of every request to read, and of every write of one register."""
+_RTU_READ_HEAD: Final = 3
+"""Bytes of an answer to a read up to its count of bytes, and it."""
+_RTU_WRITE_HEAD: Final = 7
+"""Bytes of a request to write several registers up to its count of bytes, and it."""
+_RTU_LONGEST: Final = 256
+"""Bytes that a frame has at most (Modbus over serial line, 2.5.1)."""
+_READS: Final = (READ_HOLDING_REGISTERS, READ_INPUT_REGISTERS)
+_KNOWN: Final = (*_READS, WRITE_SINGLE_REGISTER, WRITE_MULTIPLE_REGISTERS)
+
+
+def crc(data: bytes) -> bytes:
+    """Return the checksum of Modbus RTU over these bytes, as it goes on the wire."""
+    return FramerRTU.compute_CRC(data).to_bytes(2, "big")
+
+
+def rtu_frame(unit: int, pdu: bytes) -> bytes:
+    """Return a whole frame in RTU."""
+    content = bytes((unit,)) + pdu
+    return content + crc(content)
+
+
+class RtuFramer(Framer[ModbusFrame]):
+    """Finds frames of Modbus RTU by their length and checksum.
+
+    The pauses that end a frame do not survive an adapter, so they are not asked
+    for. A frame may be anybody's request or answer; exceptions are understood with
+    the 0x80 in their function and without.
+    """
+
+    def __init__(self) -> None:
+        """Start with nothing heard."""
+        super().__init__()
+        self._buffer = b""
+
+    @property
+    @override
+    def pending(self) -> int:
+        return len(self._buffer)
+
+    @override
+    def reset(self) -> None:
+        self.noise += len(self._buffer)
+        self._buffer = b""
+
+    @override
+    def feed(self, data: bytes) -> list[ModbusFrame]:
+        buffer = self._buffer + data
+        frames: list[ModbusFrame] = []
+        taken = position = 0
+        begun: int | None = None
+        while position < len(buffer):
+            lengths = _rtu_lengths(buffer, position)
+            frame = _rtu_decode(buffer, position, lengths)
+            if frame is not None:
+                self._lose(buffer[taken:position])
+                frames.append(frame)
+                position += len(frame.raw)
+                taken, begun = position, None
+                continue
+            if begun is None and any(position + n > len(buffer) for n in lengths):
+                begun = position
+            position += 1
+        kept = len(buffer) if begun is None else begun
+        self._lose(buffer[taken:kept])
+        self._buffer = buffer[kept:]
+        return frames
+
+    def _lose(self, data: bytes) -> None:
+        """Count bytes that no frame could be made of."""
+        self.noise += len(data)
+        self.bad += len(data) >= _RTU_EXCEPTION
+
+
+def _rtu_lengths(buffer: bytes, start: int) -> tuple[int, ...]:
+    """Return how long a frame that starts here may be; nothing: none starts here.
+
+    While what says so has not come yet, the shortest that would hold it.
+    """
+    if start + 1 == len(buffer):
+        return (_RTU_EXCEPTION,)
+    function = buffer[start + 1]
+    if function & ~EXCEPTION not in _KNOWN:
+        return ()
+    if function & EXCEPTION:
+        return (_RTU_EXCEPTION,)
+    counted = _rtu_counted(function, buffer[start : start + _RTU_FIXED])
+    return (*counted, _RTU_FIXED, _RTU_EXCEPTION)
+
+
+def _rtu_counted(function: int, head: bytes) -> tuple[int, ...]:
+    """Return how long a frame with a count in it is, if this can be one."""
+    if function in _READS:
+        before, count = _RTU_READ_HEAD, head[_RTU_READ_HEAD - 1 : _RTU_READ_HEAD]
+    elif function == WRITE_MULTIPLE_REGISTERS:
+        before, count = _RTU_WRITE_HEAD, head[_RTU_WRITE_HEAD - 1 : _RTU_WRITE_HEAD]
+    else:
+        return ()
+    length = before + sum(count) + _RTU_CHECKSUM
+    possible = sum(count) > 0 and sum(count) % 2 == 0 and length <= _RTU_LONGEST
+    return (length,) if possible else ()
+
+
+def _rtu_decode(
+    buffer: bytes, start: int, lengths: tuple[int, ...]
+) -> ModbusFrame | None:
+    """Return the frame that starts here and has come to its end, if there is one."""
+    for length in lengths:
+        raw = buffer[start : start + length]
+        if len(raw) == length and crc(raw[:-_RTU_CHECKSUM]) == raw[-_RTU_CHECKSUM:]:
+            return ModbusFrame(
+                raw=raw,
+                is_reply=None,
+                unit=raw[0],
+                function=raw[1],
+                data=raw[2:-_RTU_CHECKSUM],
+            )
+    return None

@@ -1,4 +1,4 @@
-"""The words every part shares: readings, orders, limits, commands, errors.
+"""The words every part shares: readings, orders, limits, commands.
 
 Units throughout: ampere, volt, watt, watt-hour, second. ``None`` means "not
 told": no value is made up for what the wire does not say, and 0 is only ever a
@@ -55,7 +55,19 @@ class Fault(StrEnum):
     METER = "meter"
     REDUCED_CURRENT = "reduced_current"
     UNKNOWN = "unknown"
+    # Told by a SmartEVSE, in its own words (README of v2, register 0xA1).
+    LESS_6A = "less_6a"
+    """Less than 6 A is left for it: it waits."""
+    NO_COMM = "no_comm"
+    """Nothing heard of its master or its meter for 10 s: it has stopped."""
+    TEMP_HIGH = "temp_high"
+    NO_CURRENT = "no_current"
+    """Its master had no current for it: it waits for a minute."""
+    RCD = "rcd"
+    NO_SUN = "no_sun"
     # Noticed by us.
+    UNSUPPORTED_FIRMWARE = "unsupported_firmware"
+    SECOND_MASTER = "second_master"
     LIMIT_EXCEEDED = "limit_exceeded"
     LIMIT_NOT_TAKEN = "limit_not_taken"
     WRONG_CHARGER = "wrong_charger"
@@ -90,6 +102,8 @@ class Capability(StrEnum):
     RESET = "reset"
     WAKE = "wake"
     SET_ADDRESS = "set_address"
+    MODE = "mode"
+    TEMPERATURE = "temperature"
 
 
 class Persistence(StrEnum):
@@ -116,6 +130,48 @@ class Command(StrEnum):
     """Value: bool, the box's own fail-safe."""
     SET_ENABLE_AFTER_POWER_CYCLE = "set_enable_after_power_cycle"
     """Value: bool, a plugged car may charge after a power failure."""
+    SET_MODE = "set_mode"
+    """Value: a `Mode`; forgotten when the charger restarts."""
+
+
+class Mode(StrEnum):
+    """What decides how much a charger offers (SmartEVSE, register 0xA8)."""
+
+    NORMAL = "normal"
+    """The limit alone."""
+    SMART = "smart"
+    """What its own meter leaves of the mains connection."""
+    SOLAR = "solar"
+    """What its own meter says that the sun leaves over."""
+
+
+class Setting(StrEnum):
+    """Something a charger keeps in its own memory; set rarely, it wears out."""
+
+    MINIMUM_CURRENT = "minimum_current"
+    """A car is not offered less, A."""
+    MAXIMUM_CURRENT = "maximum_current"
+    """This charger never offers more, A."""
+    CIRCUIT_CURRENT = "circuit_current"
+    """All chargers of one circuit together, A."""
+    MAINS_CURRENT = "mains_current"
+    """The mains connection, for modes smart and solar, A."""
+    SOLAR_START_CURRENT = "solar_start_current"
+    """Export from which solar charging starts, A a phase; negative: import."""
+    SOLAR_IMPORT_CURRENT = "solar_import_current"
+    """Import allowed while solar charging, A, sum of the phases."""
+    SOLAR_STOP_TIME = "solar_stop_time"
+    """Solar charging stops after this time at the minimum, minutes; 0: never."""
+    MODE_AT_START = "mode_at_start"
+    """0, 1, 2: `Mode` normal, smart, solar."""
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """From where to where something can be set, both included."""
+
+    minimum: int
+    maximum: int
 
 
 # -- What the user wants to stand ------------------------------------------------
@@ -289,6 +345,11 @@ class ChargerReading:
     minimum_interval: float | None = None
     """The charger does not want to be asked more often than this, s."""
     outlet_enabled: bool | None = None
+    mode: Mode | None = None
+    temperature: float | None = None
+    """Inside the box, degrees Celsius."""
+    settings: Mapping[Setting, int] = field(default_factory=dict)
+    """What is set in its own memory, as far as it was read."""
     faults: frozenset[Fault] = frozenset()
     fault_codes: tuple[str, ...] = ()
     """The charger's own codes for its faults, raw (``F9``)."""
@@ -334,6 +395,16 @@ class ChargerConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Supply:
+    """What all chargers of a bus share, where the bus has a master."""
+
+    limit: float = MINIMUM_CURRENT
+    """A for each phase, all chargers together."""
+    minimum: float = MINIMUM_CURRENT
+    """Each charger that charges gets at least this, A; else nothing."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FoundCharger:
     """A charger that answered a scan."""
 
@@ -354,93 +425,3 @@ class ScanReport:
     """Addresses at which more than one charger answers."""
     unreadable: bool = False
     """Bytes came that no frame could be made of: wrong protocol or parity."""
-
-
-# -- Errors ----------------------------------------------------------------------
-
-
-class EvseError(Exception):
-    """Anything that this library raises on purpose."""
-
-
-class LineError(EvseError):
-    """The serial line cannot be used."""
-
-
-class PortMissingError(LineError):
-    """There is no such port, or the network address does not answer."""
-
-
-class PortBusyError(LineError):
-    """Another program has the port open."""
-
-
-class PortPermissionError(LineError):
-    """The port exists, and we may not open it."""
-
-
-class PortSettingsError(LineError):
-    """The port or its URL does not take these settings."""
-
-
-class LineLostError(LineError):
-    """The port was open and is gone (unplugged adapter, closed connection)."""
-
-
-class LineBusyError(LineError):
-    """Others kept talking: no silence to speak in."""
-
-
-class ExchangeError(EvseError):
-    """A request did not get a good answer."""
-
-
-class ReplyTimeoutError(ExchangeError):
-    """Nobody answered in time."""
-
-
-class GarbledReplyError(ReplyTimeoutError):
-    """Something answered, and no good frame could be made of it."""
-
-
-class ExchangeRefusedError(ExchangeError):
-    """The charger answered that it will not."""
-
-    def __init__(self, message: str, code: int | None = None) -> None:
-        """Keep the charger's own code beside the message."""
-        super().__init__(message)
-        self.code = code
-
-
-class ImplausibleReplyError(ExchangeError):
-    """A frame with good checksums that says what cannot be; held back."""
-
-
-class WrongChargerError(EvseError):
-    """Another charger answers at this address; nothing was written."""
-
-    def __init__(self, message: str, *, expected: str | None, found: str) -> None:
-        """Keep both identities for the message to the user."""
-        super().__init__(message)
-        self.expected = expected
-        self.found = found
-
-
-class DuplicateAddressError(EvseError):
-    """Two chargers answer at one address; nothing was written."""
-
-
-class NotConfirmedError(EvseError):
-    """A command was sent and the charger never confirmed it."""
-
-
-class SupersededError(EvseError):
-    """A newer command took the place of this one before it was sent."""
-
-
-class RefusedOrderError(EvseError, ValueError):
-    """A wish that is not a usable number, or out of what may be asked."""
-
-
-class NotAvailableError(EvseError):
-    """The charger does not answer, or is not in a state for this command."""

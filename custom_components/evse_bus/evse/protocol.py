@@ -5,11 +5,13 @@ from typing import TYPE_CHECKING
 
 from .bus import Bus
 from .line import Line
+from .model import Supply
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
     from .charger import Charger
+    from .duty import Duty
     from .framing import Frame, Framer, LineSettings, Timing
     from .model import ChargerConfig, Orders, ScanReport
 
@@ -36,10 +38,21 @@ class Protocol:
     """
     probe_imposes: bool = False
     """Every message sets limits, so a scan does too: ask for the values first."""
+    duty: Callable[[Supply], Duty] | None = None
+    """Home Assistant is the master of the bus: what that takes."""
 
     def bus(
-        self, url: str, *, settings: LineSettings | None = None, name: str = ""
+        self,
+        url: str,
+        *,
+        settings: LineSettings | None = None,
+        name: str = "",
+        supply: Supply | None = None,
     ) -> Bus:
-        """Return a bus of this protocol on a port; `Bus.start` opens it."""
+        """Return a bus of this protocol on a port; `Bus.start` opens it.
+
+        ``supply`` is what its chargers share, where the bus has a master.
+        """
         line = Line(url, settings or self.settings)
-        return Bus(line, self.framer(), self.timing, name)
+        duty = self.duty(supply or Supply()) if self.duty is not None else None
+        return Bus(line, self.framer(), self.timing, name, duty=duty)

@@ -10,7 +10,8 @@ from math import isfinite
 from numbers import Real
 from typing import TYPE_CHECKING
 
-from .model import CurrentLimit, OrderChange, Orders, RefusedOrderError
+from .errors import RefusedOrderError
+from .model import CurrentLimit, OrderChange, Orders
 
 if TYPE_CHECKING:
     from .model import Limits, Phases

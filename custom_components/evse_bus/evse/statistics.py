@@ -21,6 +21,8 @@ class BusStatistics:
 
     requests: int = 0
     replies: int = 0
+    sent_only: int = 0
+    """Frames that nobody answers: broadcasts, acknowledgements."""
     timeouts: int = 0
     retries: int = 0
     merged: int = 0

@@ -7,9 +7,9 @@ yields the pauses, in seconds; what it does between two pauses is one turn.
 from collections.abc import AsyncGenerator, Callable
 from functools import partial
 
+from .errors import NotConfirmedError, ReplyTimeoutError
 from .exchange import Talk
 from .jobs import Later, Step
-from .model import NotConfirmedError, ReplyTimeoutError
 
 type Turns = AsyncGenerator[float]
 """Yields the pause before its next turn, s."""

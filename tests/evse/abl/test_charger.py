@@ -4,13 +4,8 @@ import asyncio
 
 import pytest
 
-from custom_components.evse_bus.evse.model import (
-    Capability,
-    Fault,
-    OrderChange,
-    Status,
-    WrongChargerError,
-)
+from custom_components.evse_bus.evse.errors import WrongChargerError
+from custom_components.evse_bus.evse.model import Capability, Fault, OrderChange, Status
 from tests.virtual import AblBox, Car
 
 from .scene import LIMIT, Scene, config, orders, until

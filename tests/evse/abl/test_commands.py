@@ -5,16 +5,14 @@ import asyncio
 import pytest
 
 from custom_components.evse_bus.evse.abl.dialogue import Dialogue, Pauses
-from custom_components.evse_bus.evse.model import (
-    Command,
+from custom_components.evse_bus.evse.errors import (
     EvseError,
-    Fault,
     NotAvailableError,
     NotConfirmedError,
-    OrderChange,
     RefusedOrderError,
     ReplyTimeoutError,
 )
+from custom_components.evse_bus.evse.model import Command, Fault, OrderChange
 from tests.virtual import Car, Request
 
 from .scene import (

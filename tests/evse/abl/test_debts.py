@@ -5,11 +5,8 @@ import asyncio
 import pytest
 
 from custom_components.evse_bus.evse.abl.charger import AblCharger
-from custom_components.evse_bus.evse.model import (
-    Command,
-    EvseError,
-    OrderChange,
-)
+from custom_components.evse_bus.evse.errors import EvseError
+from custom_components.evse_bus.evse.model import Command, OrderChange
 from tests.virtual import AblBox, Car, Request
 
 from .scene import LIMIT, STATE, Scene, box_with, config, orders, sleepy, until

@@ -11,7 +11,7 @@ from custom_components.evse_bus.evse.abl.duty import (
     duty_for,
     is_within,
 )
-from custom_components.evse_bus.evse.model import RefusedOrderError
+from custom_components.evse_bus.evse.errors import RefusedOrderError
 
 _tenths = st.integers(60, 800).map(lambda tenths: tenths / 10)
 

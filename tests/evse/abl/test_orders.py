@@ -6,19 +6,16 @@ from contextlib import suppress
 from hypothesis import HealthCheck, given, settings, strategies as st
 import pytest
 
-from custom_components.evse_bus.evse.model import (
+from custom_components.evse_bus.evse.errors import (
     EvseError,
     ExchangeRefusedError,
-    Fault,
     LineLostError,
     NotAvailableError,
     NotConfirmedError,
-    OrderChange,
-    Orders,
     RefusedOrderError,
     ReplyTimeoutError,
-    Status,
 )
+from custom_components.evse_bus.evse.model import Fault, OrderChange, Orders, Status
 from tests.virtual import AblBox, Car
 
 from .scene import LIMIT, Scene, config, orders, until

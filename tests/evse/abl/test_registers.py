@@ -27,14 +27,12 @@ from custom_components.evse_bus.evse.abl.registers import (
     write_limit,
     write_state,
 )
-from custom_components.evse_bus.evse.modbus import AsciiFramer, ModbusFrame
-from custom_components.evse_bus.evse.model import (
-    CurrentLimit,
+from custom_components.evse_bus.evse.errors import (
     ExchangeRefusedError,
-    Limits,
-    Orders,
     RefusedOrderError,
 )
+from custom_components.evse_bus.evse.modbus import AsciiFramer, ModbusFrame
+from custom_components.evse_bus.evse.model import CurrentLimit, Limits, Orders
 from custom_components.evse_bus.evse.safety import Setpoint, clamp
 
 MODBUS_SETTINGS = Block(0x0003, 1)

@@ -6,7 +6,8 @@ from time import monotonic
 
 import pytest
 
-from custom_components.evse_bus.evse.model import LineLostError, ScanReport
+from custom_components.evse_bus.evse.errors import LineLostError
+from custom_components.evse_bus.evse.model import ScanReport
 from tests.virtual import AblBox
 
 from .scene import READING, Scene, config, orders, until

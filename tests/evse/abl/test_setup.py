@@ -4,15 +4,14 @@ import asyncio
 
 import pytest
 
-from custom_components.evse_bus.evse.model import (
-    Command,
+from custom_components.evse_bus.evse.errors import (
     DuplicateAddressError,
     EvseError,
     NotAvailableError,
     NotConfirmedError,
-    OrderChange,
     RefusedOrderError,
 )
+from custom_components.evse_bus.evse.model import Command, OrderChange
 from tests.virtual import AblBox
 
 from .scene import (

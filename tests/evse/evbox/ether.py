@@ -13,10 +13,11 @@ from random import Random
 from typing import Self, override
 
 from custom_components.evse_bus.evse.bus import Bus
+from custom_components.evse_bus.evse.errors import LineLostError
 from custom_components.evse_bus.evse.evbox import PROTOCOL, EvboxCharger, EvboxConfig
 from custom_components.evse_bus.evse.evbox.frames import EvboxFramer
 from custom_components.evse_bus.evse.line import Line
-from custom_components.evse_bus.evse.model import CurrentLimit, LineLostError, Orders
+from custom_components.evse_bus.evse.model import CurrentLimit, Orders
 from tests.evse.simulated import now
 from tests.virtual import CLIENT, EvboxChargePoint, Faults, Order
 from tests.virtual.evbox_frames import checked, order

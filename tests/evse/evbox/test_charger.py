@@ -7,18 +7,20 @@ from typing import Any
 
 import pytest
 
+from custom_components.evse_bus.evse.errors import (
+    NotAvailableError,
+    RefusedOrderError,
+    ReplyTimeoutError,
+    WrongChargerError,
+)
 from custom_components.evse_bus.evse.evbox import PROTOCOL, EvboxCharger, EvboxConfig
 from custom_components.evse_bus.evse.model import (
     Capability,
     ChargerConfig,
     CurrentLimit,
     Fault,
-    NotAvailableError,
     OrderChange,
     Orders,
-    RefusedOrderError,
-    ReplyTimeoutError,
-    WrongChargerError,
 )
 from custom_components.evse_bus.evse.schedule import Kind
 from tests.evse.simulated import now, simulate

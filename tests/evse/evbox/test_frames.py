@@ -3,6 +3,7 @@
 from hypothesis import given, strategies as st
 import pytest
 
+from custom_components.evse_bus.evse.errors import GarbledReplyError
 from custom_components.evse_bus.evse.evbox.frames import (
     LONGEST_FRAME,
     LONGEST_REQUEST,
@@ -16,12 +17,7 @@ from custom_components.evse_bus.evse.evbox.frames import (
     encode_69,
     frame,
 )
-from custom_components.evse_bus.evse.model import (
-    CurrentLimit,
-    GarbledReplyError,
-    Limits,
-    Orders,
-)
+from custom_components.evse_bus.evse.model import CurrentLimit, Limits, Orders
 from custom_components.evse_bus.evse.safety import Setpoint, clamp
 from tests.virtual import evbox_frames as witness
 

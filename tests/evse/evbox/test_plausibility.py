@@ -6,6 +6,7 @@ from dataclasses import replace
 from hypothesis import given, strategies as st
 import pytest
 
+from custom_components.evse_bus.evse.errors import ImplausibleReplyError
 from custom_components.evse_bus.evse.evbox.frames import ModuleReply, Reply
 from custom_components.evse_bus.evse.evbox.plausibility import (
     LARGEST_CONNECTION,
@@ -14,7 +15,6 @@ from custom_components.evse_bus.evse.evbox.plausibility import (
     Taken,
     used_currents,
 )
-from custom_components.evse_bus.evse.model import ImplausibleReplyError
 
 from .replies import module, reply
 

@@ -14,14 +14,9 @@ from random import Random
 from hypothesis import HealthCheck, given, settings, strategies as st
 import pytest
 
+from custom_components.evse_bus.evse.errors import EvseError, RefusedOrderError
 from custom_components.evse_bus.evse.evbox import EvboxCharger
-from custom_components.evse_bus.evse.model import (
-    CurrentLimit,
-    EvseError,
-    OrderChange,
-    Orders,
-    RefusedOrderError,
-)
+from custom_components.evse_bus.evse.model import CurrentLimit, OrderChange, Orders
 from tests.evse.simulated import simulate
 from tests.virtual import Car, EvboxChargePoint, Module, Order
 from tests.virtual.evbox_frames import frame

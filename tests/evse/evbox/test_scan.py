@@ -6,14 +6,9 @@ from dataclasses import replace
 
 import pytest
 
+from custom_components.evse_bus.evse.errors import LineBusyError, RefusedOrderError
 from custom_components.evse_bus.evse.evbox import PROTOCOL, EvboxConfig
-from custom_components.evse_bus.evse.model import (
-    CurrentLimit,
-    LineBusyError,
-    Orders,
-    RefusedOrderError,
-    ScanReport,
-)
+from custom_components.evse_bus.evse.model import CurrentLimit, Orders, ScanReport
 from tests.evse.simulated import now, simulate
 from tests.virtual import EvboxChargePoint, Module
 from tests.virtual.evbox_frames import frame

@@ -9,19 +9,15 @@ from collections.abc import Callable
 from functools import partial
 from typing import Final, override
 
-from ..exchange import Talk
-from ..jobs import Later
-from ..model import (
-    ChargerConfig,
-    Command,
+from ..errors import (
     ExchangeRefusedError,
-    Fault,
     GarbledReplyError,
     NotAvailableError,
     NotConfirmedError,
-    OrderChange,
-    Orders,
 )
+from ..exchange import Talk
+from ..jobs import Later
+from ..model import ChargerConfig, Command, Fault, OrderChange, Orders
 from ..safety import Setpoint, clamp
 from ..turns import Turns, in_turns
 from .commands import CommandSet
@@ -238,7 +234,7 @@ class AblCharger(AblReader):
     async def command(
         self,
         command: Command,
-        value: bool | int | None = None,
+        value: bool | int | str | None = None,
     ) -> None:
         conversation, persistence = self._commands.conversation(command, value)
         await self.run(in_turns(conversation), persistence=persistence)

@@ -9,18 +9,17 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, assert_never
+from typing import TYPE_CHECKING
 
-from ..exchange import Talk
-from ..model import (
-    Command,
+from ..errors import (
     ExchangeRefusedError,
     NotAvailableError,
     NotConfirmedError,
-    Persistence,
     RefusedOrderError,
     ReplyTimeoutError,
 )
+from ..exchange import Talk
+from ..model import Command, Persistence
 from ..turns import Turns
 from .dialogue import Debt, Dialogue
 from .duty import PAUSE
@@ -57,7 +56,8 @@ class CommandSet(Dialogue):
     ) -> tuple[Callable[[Talk], Turns], Persistence]:
         """Return what carries out a command, and how often it may be begun.
 
-        Raises RefusedOrderError for a value that the command cannot have.
+        Raises RefusedOrderError for a value that the command cannot have, and
+        NotAvailableError for a command that an ABL box does not know.
         """
         turns, persistence = self._turns(command, value)
         return self._one_at_a_time(command, turns), persistence
@@ -81,7 +81,8 @@ class CommandSet(Dialogue):
             case Command.SET_ENABLE_AFTER_POWER_CYCLE:
                 settings = Settings(needs_enable=not _on_or_off(command, value))
             case _:
-                assert_never(command)
+                message = f"{self._charger.config.name} knows no command {command}"
+                raise NotAvailableError(message)
         return partial(self._set_up.run, settings), Persistence.ONCE
 
     def release(self) -> None:

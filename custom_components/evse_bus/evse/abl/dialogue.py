@@ -9,13 +9,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Final
 
-from ..exchange import Talk
-from ..model import (
+from ..errors import (
     ExchangeError,
     NotAvailableError,
     NotConfirmedError,
     ReplyTimeoutError,
 )
+from ..exchange import Talk
 from ..turns import Turns
 from .duty import is_within
 from .exchanges import set_state

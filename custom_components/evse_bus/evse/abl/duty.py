@@ -21,7 +21,8 @@ below 52.5 A has no code of its own and becomes 51 A.
 from decimal import ROUND_FLOOR, Decimal
 from typing import Final
 
-from ..model import MAXIMUM_CURRENT, MINIMUM_CURRENT, RefusedOrderError
+from ..errors import RefusedOrderError
+from ..model import MAXIMUM_CURRENT, MINIMUM_CURRENT
 
 PAUSE: Final = 0x3E8
 """100 %: no current allowed, and the cable is still seen."""

@@ -1,7 +1,7 @@
 """One exchange with a box: a block read, a register written."""
 
+from ..errors import ReplyTimeoutError
 from ..exchange import Talk
-from ..model import ReplyTimeoutError
 from ..safety import Setpoint
 from .registers import (
     CONFIGURATION_REGISTER,

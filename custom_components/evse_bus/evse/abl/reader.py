@@ -8,20 +8,15 @@ from dataclasses import dataclass
 from typing import Final, override
 
 from ..charger import Charger
-from ..exchange import Talk
-from ..framing import Timing
-from ..model import (
-    Capability,
-    ChargerConfig,
+from ..errors import (
     ExchangeRefusedError,
-    Fault,
     GarbledReplyError,
-    Limits,
-    Orders,
-    Phases,
     ReplyTimeoutError,
     WrongChargerError,
 )
+from ..exchange import Talk
+from ..framing import Timing
+from ..model import Capability, ChargerConfig, Fault, Limits, Orders, Phases
 from .exchanges import read
 from .readings import (
     EnergyEstimate,

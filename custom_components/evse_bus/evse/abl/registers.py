@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
 
+from ..errors import ExchangeRefusedError, RefusedOrderError
 from ..modbus import (
     READ_HOLDING_REGISTERS,
     WRITE_MULTIPLE_REGISTERS,
@@ -22,7 +23,7 @@ from ..modbus import (
     registers_read,
     write_registers,
 )
-from ..model import ExchangeRefusedError, Phases, RefusedOrderError
+from ..model import Phases
 from ..safety import Setpoint
 from .duty import PAUSE, duty_for
 

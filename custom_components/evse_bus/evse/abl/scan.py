@@ -7,18 +7,10 @@ from functools import partial
 from typing import Final
 
 from ..bus import Bus
+from ..errors import GarbledReplyError, LineBusyError, ReplyTimeoutError
 from ..exchange import Talk
 from ..modbus import ModbusFrame
-from ..model import (
-    ChargerConfig,
-    ChargerInfo,
-    FoundCharger,
-    GarbledReplyError,
-    LineBusyError,
-    Orders,
-    ReplyTimeoutError,
-    ScanReport,
-)
+from ..model import ChargerConfig, ChargerInfo, FoundCharger, Orders, ScanReport
 from ..protocol import Progress
 from .exchanges import read
 from .readings import charger_info

@@ -8,14 +8,14 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
-from ..exchange import Talk
-from ..model import (
+from ..errors import (
     DuplicateAddressError,
     EvseError,
     NotAvailableError,
     NotConfirmedError,
     ReplyTimeoutError,
 )
+from ..exchange import Talk
 from ..turns import Turns
 from .dialogue import BOOT_LOOKS, Debt, Dialogue
 from .exchanges import configure, read

@@ -25,17 +25,8 @@ from math import inf
 from typing import TYPE_CHECKING, Final, override
 
 from ..charger import Charger
-from ..model import (
-    Capability,
-    ChargerReading,
-    Fault,
-    GarbledReplyError,
-    ImplausibleReplyError,
-    Limits,
-    OrderChange,
-    Orders,
-    WrongChargerError,
-)
+from ..errors import GarbledReplyError, ImplausibleReplyError, WrongChargerError
+from ..model import Capability, ChargerReading, Fault, Limits, OrderChange, Orders
 from ..safety import INTERVALS_PER_TIMEOUT, Setpoint
 from ..schedule import Kind
 from .config import EvboxConfig

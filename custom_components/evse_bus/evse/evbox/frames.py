@@ -12,8 +12,8 @@ from operator import xor
 from string import hexdigits
 from typing import TYPE_CHECKING, Final, Literal, override
 
+from ..errors import GarbledReplyError
 from ..framing import Frame, Framer
-from ..model import GarbledReplyError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

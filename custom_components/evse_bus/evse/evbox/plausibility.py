@@ -17,7 +17,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
 
-from ..model import MAXIMUM_CURRENT, MINIMUM_CURRENT, ImplausibleReplyError
+from ..errors import ImplausibleReplyError
+from ..model import MAXIMUM_CURRENT, MINIMUM_CURRENT
 from .frames import ModuleReply, Reply
 from .meters import Meters, Totals
 from .timing import UNKNOWN_INTERVAL

@@ -14,16 +14,8 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from ..model import (
-    ChargerConfig,
-    FoundCharger,
-    GarbledReplyError,
-    Limits,
-    Orders,
-    RefusedOrderError,
-    ReplyTimeoutError,
-    ScanReport,
-)
+from ..errors import GarbledReplyError, RefusedOrderError, ReplyTimeoutError
+from ..model import ChargerConfig, FoundCharger, Limits, Orders, ScanReport
 from .config import EvboxConfig, evbox_config
 from .frames import ANY_SERIAL, EvboxFrame, Reply, decode_reply
 from .plausibility import range_oddities
