@@ -425,3 +425,7 @@ class ScanReport:
     """Addresses at which more than one charger answers."""
     unreadable: bool = False
     """Bytes came that no frame could be made of: wrong protocol or parity."""
+    unsupported: tuple[FoundCharger, ...] = ()
+    """Those that answered with a firmware that cannot be used this way."""
+    other_master: bool = False
+    """Another master speaks on this line; so we said nothing."""
