@@ -25,20 +25,34 @@ from .evbox import EvboxChargePoint, Module
 from .evbox_frames import Order, orders_in, rude_requests
 from .faults import Faults
 from .log import CLIENT, Entry, TrafficLog
+from .smartevse import SmartEvse
+from .smartevse_controller import (
+    BalanceBroadcast,
+    Handshake,
+    RegisterWrite,
+    SmartEvseController,
+)
+from .smartevse_frames import SmartEvseRequest, smartevse_requests_in
 
 __all__ = [
     "CLIENT",
     "AblBox",
+    "BalanceBroadcast",
     "Car",
     "CarLife",
     "Device",
     "Entry",
     "EvboxChargePoint",
     "Faults",
+    "Handshake",
     "Module",
     "Order",
     "Outlet",
+    "RegisterWrite",
     "Request",
+    "SmartEvse",
+    "SmartEvseController",
+    "SmartEvseRequest",
     "TrafficLog",
     "VirtualBus",
     "Write",
@@ -47,4 +61,5 @@ __all__ = [
     "orders_in",
     "requests_in",
     "rude_requests",
+    "smartevse_requests_in",
 ]

@@ -58,6 +58,7 @@ class Car:
     It follows a changed offer after `reaction` seconds, at `max_current` per `ramp`
     seconds. Offered less than its minimum (or nothing), it stops. `greedy` makes it
     draw more than offered (1.1 = 10 % too much). `wanted_wh` = None is never full.
+    `asks_without_pwm`: goes on asking (6 V) when the PWM stops; a real car does not.
     The methods may be called from any thread at any time.
     """
 
@@ -73,6 +74,7 @@ class Car:
         wanted_wh: float | None = None,
         cos_phi: float = 0.98,
         greedy: float = 1.0,
+        asks_without_pwm: bool = False,
         life: CarLife | None = None,
     ) -> None:
         """Make a car that is away."""
@@ -85,6 +87,7 @@ class Car:
         self.wanted_wh = wanted_wh
         self.cos_phi = cos_phi
         self.greedy = greedy
+        self.asks_without_pwm = asks_without_pwm
         self.life = life
         self.plugged = False
         self.requesting = False

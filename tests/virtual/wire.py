@@ -126,6 +126,10 @@ class Wire:
         """Return when the last byte heard was over."""
         return self._last_end
 
+    def begun_before(self, at: float, listener: str) -> bool:
+        """Tell whether somebody else who is still sending had begun by then."""
+        return any(t.start <= at and t.source != listener for t in self._active)
+
     def busy(self, now: float) -> bool:
         """Tell whether somebody is sending right now."""
         return any(t.start <= now < t.end for t in self._active)

@@ -1,0 +1,248 @@
+"""A virtual SmartEVSE v2 on the bus: polled, as a slave, or as a master."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+from .device import Device, on_bus_thread
+from .smartevse_controller import SmartEvseController
+from .smartevse_frames import ANSWER_SILENCE, FRAME_GAP, LONGEST
+from .smartevse_registers import DIALECTS, NORMAL
+
+if TYPE_CHECKING:
+    import asyncio
+    from collections import Counter
+
+    from .car import Car
+    from .smartevse_controller import BalanceBroadcast, Handshake, RegisterWrite
+    from .smartevse_outlet import SmartEvseOutlet
+    from .wire import Segment
+
+# Later than the answer's silence, or it would never be the turn-round that counts.
+EPSILON = 0.0001
+
+
+class SmartEvse(Device):
+    """A SmartEVSE; `controller` is what it makes of frames, `outlet` its inside.
+
+    - `dialect`: "2.17", "2.20" or "later"; `load_balance`: 0 off, 1 master, else slave
+      and unit; `unit`: its address with load balancing off, if not the dialect's
+    - `config`: "socket" (with a `cable` of 13, 16, 32 or 63 A) or "fixed"
+    - `override_works`: False = a 2.17 before the override: refused, no effect
+    - `settings`: further stored settings by name, see `smartevse_registers`
+    """
+
+    baud: ClassVar[int] = 9600
+    parity: ClassVar[str] = "N"
+    protocol: ClassVar[str] = "smartevse"
+
+    def __init__(
+        self,
+        dialect: Literal["2.17", "2.20", "later"] = "2.17",
+        *,
+        load_balance: int = 0,
+        car: Car | None = None,
+        config: Literal["socket", "fixed"] = "socket",
+        cable: int = 16,
+        max_current: int = 13,
+        min_current: int = 6,
+        mode: int = NORMAL,
+        serial: int = 1,
+        unit: int | None = None,
+        override_works: bool = True,
+        settings: dict[str, int] | None = None,
+        turn_round: float = 0.01,
+        jitter: float = 0.02,
+        name: str = "",
+    ) -> None:
+        """Make a box that is switched on when the bus starts."""
+        stored = {
+            "load_balance": load_balance,
+            "config": int(config == "fixed"),
+            "max_current": max_current,
+            "min_current": min_current,
+            "mode": mode,
+            **(settings or {}),
+        }
+        self.controller = SmartEvseController(
+            DIALECTS[dialect],
+            car,
+            cable=cable,
+            settings=stored,
+            unit=unit,
+            serial=serial,
+            override_works=override_works,
+        )
+        super().__init__(name or f"smartevse-{self.controller.unit}")
+        self.turn_round = turn_round
+        self.jitter = jitter
+        self.unasked = 0
+        self._heard = bytearray()
+        self._heard_until = float("-inf")
+        self._frame_timer: asyncio.TimerHandle | None = None
+
+    # What a test looks at
+
+    @property
+    def outlet(self) -> SmartEvseOutlet:
+        """Return the inside."""
+        return self.controller.outlet
+
+    @property
+    def car(self) -> Car | None:
+        """Return the car it charges, or would."""
+        return self.outlet.car
+
+    @property
+    def unit(self) -> int:
+        """Return the address it has now."""
+        return self.controller.unit
+
+    @property
+    def state(self) -> str:
+        """Return the state: A to D, E to H waiting for a master, T, B1, C1."""
+        return self.outlet.state
+
+    @property
+    def access(self) -> bool:
+        """Tell whether it may charge."""
+        return self.outlet.access
+
+    @property
+    def error(self) -> int:
+        """Return the error bits."""
+        return self.outlet.error
+
+    @property
+    def contactor(self) -> bool:
+        """Tell whether the contactor is closed: whether the car has voltage."""
+        return self.outlet.contactor
+
+    @property
+    def pilot_current(self) -> float:
+        """Return what the pilot offers the car, A; 0 without PWM."""
+        return self.outlet.pilot_current
+
+    @property
+    def car_current(self) -> float:
+        """Return what the car draws, A per phase."""
+        return self.outlet.car_current
+
+    @property
+    def writes(self) -> list[RegisterWrite]:
+        """Return all writes it understood, oldest first."""
+        return self.controller.writes
+
+    @property
+    def eeprom_writes(self) -> Counter[int]:
+        """Return how often each register was stored in its EEPROM."""
+        return self.controller.eeprom_writes
+
+    @property
+    def broadcasts(self) -> list[BalanceBroadcast]:
+        """Return the charge currents it heard as a slave."""
+        return self.controller.broadcasts
+
+    @property
+    def requests_sent(self) -> list[Handshake]:
+        """Return what it asked its master for (01 to 04)."""
+        return self.controller.requests_sent
+
+    @property
+    def answers(self) -> list[Handshake]:
+        """Return the acknowledgements it heard (81 to 84)."""
+        return self.controller.answers
+
+    def stats(self) -> dict[str, object]:
+        """Return the counters."""
+        controller = self.controller
+        return {
+            **super().stats(),
+            "unasked": self.unasked,
+            "dropped": controller.dropped,
+            "ignored": controller.ignored,
+            "writes": len(controller.writes),
+            "eeprom_writes": sum(controller.eeprom_writes.values()),
+            "broadcasts": len(controller.broadcasts),
+            "state": self.state,
+            "error": self.error,
+            "access": self.access,
+            "contactor": self.contactor,
+            "pilot_current": self.pilot_current,
+            "car_current": round(self.car_current, 2),
+        }
+
+    # What a test does
+
+    @on_bus_thread
+    def press_access(self) -> None:
+        """Press the button, or move the switch, at the box; see setting `switch`."""
+        self.outlet.press()
+
+    @on_bus_thread
+    def power_cycle(self) -> None:
+        """Lose power for a moment: access is open again, the override is gone."""
+        self.controller.power_cycle()
+
+    @on_bus_thread
+    def set_at_the_box(self, name: str, value: int) -> None:
+        """Change a stored setting in the box's own menu."""
+        setting = self.controller.dialect.settings[name]
+        if not setting.low <= value <= setting.high:
+            msg = f"{name} is {setting.low} to {setting.high}"
+            raise ValueError(msg)
+        self.outlet.settings[name] = value
+        self.outlet.stored[name] = value
+        self.outlet.open_access()
+
+    # On the bus
+
+    def step(self) -> None:
+        """Bring the box up to now; say what it wants to say."""
+        self.controller.step(self.now())
+        self._speak()
+
+    def _speak(self) -> None:
+        sending = self.controller.sending
+        while sending:
+            data = sending.pop(0)
+            wait = self.bus.rng.random() * self.jitter if self.bus is not None else 0.0
+            self.unasked += 1
+            self.send(data, wait, ANSWER_SILENCE + EPSILON)
+
+    def hear(self, segment: Segment) -> None:
+        """Hear bytes: more than 3 ms of silence end a frame."""
+        bus = self.bus
+        if bus is None:
+            return
+        if self._frame_timer is not None:
+            self._frame_timer.cancel()
+            self._frame_timer = None
+        if self._heard and segment.start - self._heard_until > FRAME_GAP:
+            self._take_frame()
+        self._heard += segment.data
+        self._heard_until = segment.end
+        self._frame_timer = bus.loop.call_at(
+            segment.end + FRAME_GAP + EPSILON, self._frame_over
+        )
+
+    def _frame_over(self) -> None:
+        self._frame_timer = None
+        bus = self.bus
+        if bus is None:
+            return
+        # Bytes reach us a run at a time: one that began meanwhile belongs to this
+        # frame if it began soon enough.
+        if not bus.wire.begun_before(self._heard_until + FRAME_GAP, self.name):
+            self._take_frame()
+
+    def _take_frame(self) -> None:
+        data, self._heard = bytes(self._heard[: LONGEST + 1]), bytearray()
+        ended = self._heard_until
+        answer = self.controller.receive(data, self.now())
+        self._speak()
+        if answer is None or self.bus is None:
+            return
+        self.requests += 1
+        wait = max(0.0, ended + self.turn_round - self.bus.time())
+        self.send(answer, wait, ANSWER_SILENCE + EPSILON)

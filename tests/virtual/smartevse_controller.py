@@ -1,0 +1,385 @@
+"""What a virtual SmartEVSE v2 makes of frames: registers, refusals, silence.
+
+Frames in, frames out, and the devices' time: no wire and no thread, so that it also
+works where time is simulated.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from .smartevse_frames import (
+    READS,
+    WRITE_ONE,
+    WRITE_SEVERAL,
+    Packet,
+    decode,
+    exception_frame,
+    frame,
+    values_frame,
+    words,
+    write_frame,
+    write_several_frame,
+)
+from .smartevse_outlet import COMM_TIMEOUT, SmartEvseOutlet, pwm_of
+from .smartevse_registers import MASTER, NO_CURRENT, NORMAL, Setting
+
+if TYPE_CHECKING:
+    from .car import Car
+    from .smartevse_registers import Dialect
+
+ILLEGAL_ADDRESS, ILLEGAL_VALUE = 0x02, 0x03
+ERROR_BROADCAST = 0x02
+ACKNOWLEDGEMENTS = range(0x81, 0x85)
+REQUESTS = range(0x01, 0x05)
+KELVIN = 273
+VOLATILE_MODE_2_17 = 0xA8
+
+
+@dataclass(frozen=True, slots=True)
+class RegisterWrite:
+    """A write that the box understood: when (its time), what, and what became of it.
+
+    `taken`: how many registers took their value, by the box's own count; the override
+    of a 2.17 is taken although it does not count.
+    """
+
+    t: float
+    unit: int
+    function: int
+    register: int
+    values: tuple[int, ...]
+    taken: int
+    answered: bool
+
+
+@dataclass(frozen=True, slots=True)
+class BalanceBroadcast:
+    """Charge currents heard from a master: when (box's time), and 0.1 A per unit."""
+
+    t: float
+    currents: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Handshake:
+    """A request of a slave (01 to 04) or an acknowledgement (81 to 84), box's time."""
+
+    t: float
+    register: int
+    value: int
+
+
+class SmartEvseController:
+    """The controller of one box, with its outlet.
+
+    `receive` a frame at a time; `step`, and send what is then in `sending`.
+    """
+
+    def __init__(
+        self,
+        dialect: Dialect,
+        car: Car | None = None,
+        *,
+        cable: int = 16,
+        settings: dict[str, int] | None = None,
+        unit: int | None = None,
+        serial: int = 1,
+        override_works: bool = True,
+    ) -> None:
+        """Make a controller that was just switched on."""
+        self.dialect = dialect
+        self.outlet = SmartEvseOutlet(dialect, car, cable=cable, settings=settings)
+        self.unit_when_disabled = dialect.unit_when_disabled if unit is None else unit
+        self.serial = serial
+        self.override_works = override_works
+        self.now = 0.0
+        self.sending: list[bytes] = []
+        self.writes: list[RegisterWrite] = []
+        self.eeprom_writes: Counter[int] = Counter()
+        self.broadcasts: list[BalanceBroadcast] = []
+        self.requests_sent: list[Handshake] = []
+        self.answers: list[Handshake] = []
+        self.config_changed = 0
+        self.dropped = 0
+        self.ignored = 0
+        self._last_request: tuple[int, int] | None = None
+
+    @property
+    def unit(self) -> int:
+        """Return its address: the load-balance setting, if there is one."""
+        return self.outlet.load_balance or self.unit_when_disabled
+
+    def power_cycle(self) -> None:
+        """Lose power for a moment: access open again, override and errors gone."""
+        self.outlet.power_up()
+        self.sending.clear()
+        self.config_changed = 0
+        self._last_request = None
+
+    def step(self, now: float) -> None:
+        """Live until `now`; what it wants to say is then in `sending`."""
+        self.now = now
+        out = self.outlet
+        cycles = out.cycles
+        out.step(now)
+        for register, value in out.asked:
+            self.requests_sent.append(Handshake(now, register, value))
+            self._say_request(write_frame(self.unit, register, value))
+        out.asked.clear()
+        error_register = self.dialect.register_of("error")
+        for bits in out.error_broadcasts:
+            register = error_register if self.dialect.status_writable else 2
+            self._say_request(write_frame(self.dialect.broadcast_unit, register, bits))
+        out.error_broadcasts.clear()
+        if out.load_balance == MASTER and out.cycles != cycles:
+            self._broadcast()
+
+    def _broadcast(self) -> None:
+        """As a master: say what everybody may draw."""
+        currents = [self.outlet.current] + [0] * (self.dialect.units - 1)
+        self._say_request(
+            write_several_frame(
+                self.dialect.broadcast_unit, self.dialect.balance_register, *currents
+            )
+        )
+
+    def _say_request(self, data: bytes) -> None:
+        self._last_request = (data[0], data[1])
+        self.sending.append(data)
+
+    # Frames
+
+    def receive(self, data: bytes, now: float) -> bytes | None:
+        """Take a frame that silence has ended; return the answer, if any."""
+        self.step(now)
+        packet = decode(data, self.dialect.functions)
+        if packet is None or not self._is_request(packet):
+            return None
+        if self.outlet.load_balance <= MASTER and self.dialect.external_master:
+            self.outlet.external_master = 4
+        answer = self._obey(packet)
+        if answer is None:
+            self.ignored += 1
+        return answer
+
+    def _is_request(self, packet: Packet) -> bool:
+        """Tell a request from somebody's answer, by what was heard or sent last."""
+        if packet.kind == "answer":
+            self._last_request = None
+            return False
+        this = (packet.unit, packet.function)
+        broadcast = packet.unit == self.dialect.broadcast_unit
+        counts = not broadcast or not self.dialect.status_writable
+        if packet.kind == "either" and this == self._last_request and counts:
+            self._last_request = None
+            exempt = packet.register in REQUESTS or packet.register in ACKNOWLEDGEMENTS
+            if self.dialect.status_writable or not exempt:
+                self.dropped += 1
+                return False
+            return True
+        self._last_request = this
+        return True
+
+    def _obey(self, packet: Packet) -> bytes | None:
+        own = packet.unit == self.unit
+        if packet.function in READS:
+            return self._read(packet) if own else None
+        if not own and packet.unit != self.dialect.broadcast_unit:
+            return None
+        if packet.function == WRITE_SEVERAL and self._balance(packet):
+            return None
+        if packet.register in self.dialect.silent:
+            return self._handshake(packet)
+        return self._write(packet)
+
+    def _hidden(self, packet: Packet) -> bool:
+        """Tell whether the volatile mode makes the whole request vanish."""
+        if self.dialect.gentle or packet.register != VOLATILE_MODE_2_17:
+            return False
+        return self.outlet.disabled or self.outlet.settings["mode"] == NORMAL
+
+    def _read(self, packet: Packet) -> bytes | None:
+        if packet.register in self.dialect.silent or self._hidden(packet):
+            return None
+        items = self.dialect.find(packet.register, packet.count)
+        if items is None:
+            return exception_frame(packet.unit, packet.function, ILLEGAL_ADDRESS)
+        values = [self.value_of(item) & 0xFFFF for item in items]
+        return values_frame(packet.unit, packet.function, values)
+
+    def value_of(self, item: str | Setting) -> int:
+        """Return what a register holds."""
+        out = self.outlet
+        if isinstance(item, Setting):
+            return out.settings[item.name]
+        maximum = min(out.settings["max_current"], out.cable_measured)
+        values = {
+            "state": self.dialect.states[out.state],
+            "error": out.error,
+            "cable": out.cable_measured,
+            "maximum": maximum,
+            "minimum": out.settings["min_current"],
+            "current": out.current,
+            "access": int(out.access),
+            "mode_now": out.settings["mode"],
+            "solar_timer": out.solar_timer,
+            "config_changed": self.config_changed,
+            "phases": out.phases,
+            "temperature": out.temperature + KELVIN,
+            "serial": self.serial,
+            "ev_meter_now": out.settings.get("ev_meter", 0),
+            "ev_address_now": out.settings.get("ev_address", 0),
+        }
+        return values.get(item, 0)
+
+    # Writes
+
+    def _write(self, packet: Packet) -> bytes | None:
+        if self._hidden(packet):
+            return None
+        items = self.dialect.find(packet.register, packet.count)
+        taken = self._set_all(packet, items or ())
+        answered = packet.unit != self.dialect.broadcast_unit or self.outlet.disabled
+        self._note(packet, taken, answered=answered)
+        if not answered:
+            return None
+        unit, function = packet.unit, packet.function
+        if items is None:
+            return exception_frame(unit, function, ILLEGAL_ADDRESS)
+        if not taken:
+            return exception_frame(unit, function, ILLEGAL_VALUE)
+        if function == WRITE_ONE:
+            return write_frame(unit, packet.register, packet.values[0])
+        return frame(unit, function, words(packet.register, taken))
+
+    def _set_all(self, packet: Packet, items: tuple[str | Setting, ...]) -> int:
+        """Set what lies there; store it if it is a setting; count what was taken."""
+        taken = 0
+        stored = False
+        for index, (item, value) in enumerate(zip(items, packet.values, strict=False)):
+            if not self._set(item, value):
+                continue
+            taken += 1
+            if isinstance(item, Setting):
+                stored = True
+                self.eeprom_writes[packet.register + index] += 1
+        if stored:
+            self.outlet.stored = dict(self.outlet.settings)
+            self.outlet.open_access()
+            self.config_changed = 1
+        return taken
+
+    def _note(self, packet: Packet, taken: int, *, answered: bool) -> None:
+        self.writes.append(
+            RegisterWrite(
+                self.now,
+                packet.unit,
+                packet.function,
+                packet.register,
+                packet.values,
+                taken,
+                answered,
+            )
+        )
+
+    def _set(self, item: str | Setting, value: int) -> bool:
+        """Set a register; return what the box believes came of it."""
+        out = self.outlet
+        if isinstance(item, Setting):
+            taken = item.low <= value <= item.high
+            if taken:
+                out.settings[item.name] = value
+        elif item == "current":
+            # A 2.17 takes it and says that it did not.
+            taken = self.dialect.status_writable
+            if self.override_works:
+                out.override = value
+        elif item == "access":
+            taken = value in (0, 1) or self.dialect.status_writable
+            if value in (0, 1):
+                out.set_access(bool(value))
+        elif item == "mode_now":
+            taken = self._set_mode(value)
+        else:
+            taken = self.dialect.status_writable and self._set_status(item, value)
+        return taken
+
+    def _set_mode(self, value: int) -> bool:
+        """Set the mode without storing it."""
+        out = self.outlet
+        if self.dialect.gentle and (out.disabled or out.settings["mode"] == NORMAL):
+            return True
+        mode = self.dialect.settings["mode"]
+        if not mode.low <= value <= mode.high:
+            return False
+        out.settings["mode"] = value
+        return True
+
+    def _set_status(self, item: str, value: int) -> bool:
+        """Set what a master of a later dialect may set in its nodes."""
+        out = self.outlet
+        if item == "state":
+            names = {code: name for name, code in self.dialect.states.items()}
+            state = names.get(value, "A")
+            # "Granted": the node goes on by itself.
+            out.go({"F": "B", "H": "C"}.get(state, state))
+        elif item == "error":
+            out.set_error(value)
+        elif item == "solar_timer":
+            out.solar_timer = value
+        elif item == "config_changed":
+            self.config_changed = value
+        elif item == "phases" and value <= 3:
+            out.phases = value
+        else:
+            return False
+        return True
+
+    # Load balancing
+
+    def _balance(self, packet: Packet) -> bool:
+        """Hear charge currents; tell whether that is all there is to do."""
+        if packet.register != self.dialect.balance_register or not self.outlet.slave:
+            return False
+        index = self.outlet.load_balance - 1
+        if index >= len(packet.values):
+            return True
+        out = self.outlet
+        if not self.dialect.status_writable and packet.unit != 0:
+            return True
+        self.broadcasts.append(BalanceBroadcast(self.now, packet.values))
+        out.current = packet.values[index]
+        out.comm_timeout = COMM_TIMEOUT
+        if self.dialect.status_writable and not out.current and out.state == "C":
+            out.go("C1" if self.dialect.gentle else "A")
+        elif out.state in ("B", "C"):
+            out.pilot_current = pwm_of(out.current)
+        return True
+
+    def _handshake(self, packet: Packet) -> None:
+        """Hear an error broadcast or an acknowledgement: never answered."""
+        if packet.function != WRITE_ONE:
+            return
+        out = self.outlet
+        register, value = packet.register, packet.values[0]
+        self._note(packet, 1, answered=False)
+        if packet.unit == 0 and out.slave and register == ERROR_BROADCAST:
+            out.set_error(value)
+        if packet.unit != out.load_balance or register not in ACKNOWLEDGEMENTS:
+            return
+        self.answers.append(Handshake(self.now, register, value))
+        if register == ACKNOWLEDGEMENTS[0]:
+            out.go("A")
+        elif register == ACKNOWLEDGEMENTS[3]:
+            out.go("B")
+        elif not value:
+            out.error |= NO_CURRENT
+        elif register == ACKNOWLEDGEMENTS[1]:
+            out.enter_b()
+            out.pilot_current = pwm_of(value)
+        else:
+            out.go("C")
+            out.pilot_current = pwm_of(value)

@@ -1,0 +1,337 @@
+"""The registers of the three SmartEVSE dialects, as tables.
+
+The manual's C and E tables do not fit the firmware that was recorded; the order here
+is the recorded one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from .smartevse_frames import READ_HOLDING, READ_INPUT, WRITE_ONE, WRITE_SEVERAL
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+NORMAL, SMART, SOLAR = range(3)
+DISABLED, MASTER = range(2)
+ACCESS_BUTTON, ACCESS_SWITCH = 1, 2
+
+LESS_6A, NO_COMM, TEMP_HIGH, NO_CURRENT, RCD, NO_SUN = (1 << bit for bit in range(6))
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """A stored setting: name, range, and the value it is delivered with."""
+
+    name: str
+    low: int
+    high: int
+    default: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Registers in a row: of the status (names only) or of stored settings."""
+
+    start: int
+    items: tuple[str | Setting, ...]
+
+    def find(self, register: int, count: int) -> tuple[str | Setting, ...] | None:
+        """Return what lies there, or None if that reaches beyond the block."""
+        first = register - self.start
+        if 0 <= first < len(self.items) and first + count <= len(self.items):
+            return self.items[first : first + count]
+        return None
+
+
+@dataclass(frozen=True, slots=True)
+class Dialect:
+    """What one firmware understands.
+
+    `unit_when_disabled`: its address without load balancing; `gentle`: it asks the car
+    to stop (C1, B1) before it opens the contactor; `external_master`: foreign requests
+    stop its own cycle; `balance_register`: where a master broadcasts currents;
+    `silent`: write-only registers that are never answered.
+    """
+
+    name: str
+    functions: tuple[int, ...]
+    unit_when_disabled: int
+    broadcast_unit: int
+    balance_register: int
+    units: int
+    states: Mapping[str, int]
+    blocks: tuple[Block, ...]
+    silent: frozenset[int]
+    gentle: bool = False
+    external_master: bool = False
+    status_writable: bool = True
+
+    def find(self, register: int, count: int) -> tuple[str | Setting, ...] | None:
+        """Return what lies in these registers, or None for an unmapped one."""
+        for block in self.blocks:
+            found = block.find(register, count)
+            if found is not None:
+                return found
+        return None
+
+    @property
+    def settings(self) -> dict[str, Setting]:
+        """Return all stored settings by name."""
+        everything = (item for block in self.blocks for item in block.items)
+        return {s.name: s for s in everything if isinstance(s, Setting)}
+
+    def register_of(self, name: str) -> int:
+        """Return the register of a status item or a setting."""
+        for block in self.blocks:
+            for index, item in enumerate(block.items):
+                if name == (item.name if isinstance(item, Setting) else item):
+                    return block.start + index
+        raise KeyError(name)
+
+
+CONFIG = Setting("config", 0, 1)
+MIN_CURRENT = Setting("min_current", 6, 16, 6)
+MAX_CURRENT = Setting("max_current", 6, 80, 13)
+LOCK = Setting("lock", 0, 2)
+STOP_TIME = Setting("stop_time", 0, 60)
+SWITCH = Setting("switch", 0, 4)
+RC_MONITOR = Setting("rc_monitor", 0, 1)
+MODE = Setting("mode", 0, 2)
+GRID = Setting("grid", 0, 1)
+MEASURES = Setting("mains_measures", 0, 1)
+ORDER = Setting("custom_order", 0, 3)
+
+
+def _meter(name: str, address: int, kinds: int, lowest: int) -> tuple[Setting, Setting]:
+    return (
+        Setting(f"{name}_meter", 0, kinds),
+        Setting(f"{name}_address", lowest, 255 if lowest < 10 else 247, address),
+    )
+
+
+def _custom(*names: str) -> tuple[Setting, ...]:
+    return tuple(
+        Setting(f"custom_{name}", 0, 8 if name.endswith("divisor") else 65530)
+        for name in names
+    )
+
+
+_CUSTOM_2_20 = _custom(
+    "current",
+    "current_divisor",
+    "voltage",
+    "voltage_divisor",
+    "power",
+    "power_divisor",
+    "energy",
+    "energy_divisor",
+)
+_LETTERS = ("A", "B", "C", "D", "E", "F", "G", "H")
+
+V2_17 = Dialect(
+    name="2.17",
+    functions=(READ_INPUT, WRITE_ONE, WRITE_SEVERAL),
+    unit_when_disabled=0,
+    broadcast_unit=0,
+    balance_register=0x01,
+    units=4,
+    # E to H wait for the master: E for A, F for B, G for C, H for C to B.
+    states={letter: ord(letter) for letter in (*_LETTERS, "T")},
+    blocks=(
+        Block(
+            0xA0,
+            (
+                "state",
+                "error",
+                "cable",
+                "minimum",
+                "phases",
+                "real_current",
+                "current",
+                "access",
+                "mode_now",
+            ),
+        ),
+        Block(
+            0xC0,
+            (
+                CONFIG,
+                Setting("load_balance", 0, 4),
+                MIN_CURRENT,
+                Setting("circuit", 10, 80, 16),
+                LOCK,
+                Setting("start_current", 1, 16, 4),
+                STOP_TIME,
+                Setting("import_current", 0, 6),
+                SWITCH,
+            ),
+        ),
+        Block(
+            0xE0,
+            (
+                MAX_CURRENT,
+                MODE,
+                Setting("mains", 10, 100, 25),
+                Setting("calibration", 30, 200, 100),
+                Setting("mains_meter", 1, 5, 0),
+                GRID,
+                Setting("mains_address", 5, 255, 10),
+                MEASURES,
+                *_meter("pv", 11, 5, 5),
+                ORDER,
+                Setting("custom_current", 0, 255),
+            ),
+        ),
+    ),
+    silent=frozenset((*range(0x01, 0x05), *range(0x81, 0x85))),
+    status_writable=False,
+)
+
+V2_20 = Dialect(
+    name="2.20",
+    functions=(READ_HOLDING, READ_INPUT, WRITE_ONE, WRITE_SEVERAL),
+    unit_when_disabled=1,
+    broadcast_unit=9,
+    balance_register=0x01,
+    units=8,
+    states={letter: index for index, letter in enumerate((*_LETTERS, "T"))},
+    blocks=(
+        Block(
+            0xA0,
+            (
+                "state",
+                "error",
+                "cable",
+                "minimum",
+                "phases",
+                "real_current",
+                "current",
+                "access",
+                "mode_now",
+                "ev_meter_now",
+                "ev_address_now",
+                "solar_timer",
+            ),
+        ),
+        Block(
+            0xC0,
+            (
+                CONFIG,
+                Setting("load_balance", 0, 8),
+                MIN_CURRENT,
+                MAX_CURRENT,
+                LOCK,
+                Setting("start_current", 1, 16, 4),
+                STOP_TIME,
+                SWITCH,
+                RC_MONITOR,
+                Setting("import_current", 0, 6),
+                Setting("rfid", 0, 4),
+                *_meter("ev", 12, 9, 10),
+            ),
+        ),
+        Block(
+            0xE0,
+            (
+                Setting("circuit", 10, 160, 16),
+                MODE,
+                Setting("mains", 10, 200, 25),
+                Setting("calibration", 307, 2048, 1024),
+                Setting("mains_meter", 1, 9, 0),
+                Setting("mains_address", 10, 247, 10),
+                MEASURES,
+                *_meter("pv", 11, 9, 10),
+                ORDER,
+                *_CUSTOM_2_20,
+                GRID,
+                Setting("custom_double", 0, 1),
+            ),
+        ),
+    ),
+    silent=frozenset({0x01}),
+)
+
+LATER = Dialect(
+    name="later",
+    functions=(READ_HOLDING, READ_INPUT, WRITE_ONE, WRITE_SEVERAL),
+    unit_when_disabled=1,
+    broadcast_unit=9,
+    balance_register=0x20,
+    units=8,
+    states={letter: index for index, letter in enumerate((*_LETTERS, "T", "B1", "C1"))},
+    blocks=(
+        Block(
+            0x0000,
+            (
+                "state",
+                "error",
+                "current",
+                "mode_now",
+                "solar_timer",
+                "access",
+                "config_changed",
+                "maximum",
+                "phases",
+                "real_current",
+                "temperature",
+                "serial",
+            ),
+        ),
+        Block(
+            0x0100,
+            (
+                CONFIG,
+                LOCK,
+                MIN_CURRENT,
+                MAX_CURRENT,
+                Setting("load_balance", 0, 8),
+                SWITCH,
+                RC_MONITOR,
+                Setting("rfid", 0, 5),
+                *_meter("ev", 12, 9, 10),
+            ),
+        ),
+        Block(
+            0x0200,
+            (
+                MODE,
+                Setting("circuit", 10, 160, 16),
+                GRID,
+                Setting("calibration", 307, 2048, 1024),
+                Setting("mains", 10, 200, 25),
+                # Ampere + 16, minutes, ampere + 48.
+                Setting("start_current", 0, 32, 12),
+                STOP_TIME,
+                Setting("import_current", 0, 96, 48),
+                Setting("mains_meter", 1, 9, 0),
+                Setting("mains_address", 10, 247, 10),
+                MEASURES,
+                *_meter("pv", 11, 9, 10),
+                ORDER,
+                Setting("custom_type", 0, 2),
+                Setting("custom_function", 3, 4, 4),
+                *_custom(
+                    "voltage",
+                    "voltage_divisor",
+                    "current",
+                    "current_divisor",
+                    "power",
+                    "power_divisor",
+                    "energy",
+                    "energy_divisor",
+                ),
+                Setting("custom_longest", 3, 255, 3),
+                Setting("wifi", 0, 2),
+                Setting("capacity", 9, 200, 9),
+            ),
+        ),
+    ),
+    silent=frozenset(),
+    gentle=True,
+    external_master=True,
+)
+
+DIALECTS = {dialect.name: dialect for dialect in (V2_17, V2_20, LATER)}
