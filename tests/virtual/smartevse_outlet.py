@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 # Times in seconds of the devices' time. The recorded box's second is a little short.
 STEP = 0.01
 SECOND = 0.989
-DEBOUNCE = 0.02
-CABLE_MEASUREMENT = 0.1
-ACK_TIMEOUT = 0.975
+DEBOUNCE = 0.01
+CABLE_MEASUREMENT = 0.09
+ACK_TIMEOUT = 0.98
 CHARGE_DELAY = 60
 STOP_DELAY = 15
 B1_DELAY = 3
