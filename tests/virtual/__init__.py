@@ -26,13 +26,9 @@ from .evbox_frames import Order, orders_in, rude_requests
 from .faults import Faults
 from .log import CLIENT, Entry, TrafficLog
 from .smartevse import SmartEvse
-from .smartevse_controller import (
-    BalanceBroadcast,
-    Handshake,
-    RegisterWrite,
-    SmartEvseController,
-)
+from .smartevse_controller import SmartEvseController
 from .smartevse_frames import SmartEvseRequest, smartevse_requests_in
+from .smartevse_history import BalanceBroadcast, Handshake, RegisterWrite
 
 __all__ = [
     "CLIENT",

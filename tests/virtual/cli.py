@@ -16,6 +16,8 @@ from .bus import VirtualBus
 from .car import Car, CarLife
 from .control import HELP, Control, describe
 from .evbox import EvboxChargePoint, Module
+from .smartevse import SmartEvse
+from .smartevse_registers import DIALECTS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -28,7 +30,8 @@ STATUS_INTERVAL = 5.0
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run until SIGTERM, SIGINT, or the end of --duration."""
     options = _parser().parse_args(arguments)
-    devices = _abl(options) if options.protocol == "abl" else _evbox(options)
+    make = {"abl": _abl, "evbox": _evbox, "smartevse": _smartevse}
+    devices = make[options.protocol](options)
     for device in devices:
         if _number(device) in options.dead:
             device.faults.dead = True
@@ -90,6 +93,8 @@ def _say(text: str) -> None:
 def _number(device: Device) -> int:
     if isinstance(device, AblBox):
         return device.device_id
+    if isinstance(device, SmartEvse):
+        return device.unit
     return int(device.serial) if isinstance(device, EvboxChargePoint) else 0
 
 
@@ -155,6 +160,29 @@ def _evbox(options: argparse.Namespace) -> list[Device]:
     return points
 
 
+def _smartevse(options: argparse.Namespace) -> list[Device]:
+    boxes: list[Device] = []
+    cables = options.cables
+    for index, load_balance in enumerate(options.load_balance):
+        boxes.append(
+            SmartEvse(
+                options.dialect,
+                load_balance=load_balance,
+                car=_car(options, index),
+                config="fixed" if options.fixed_cable else "socket",
+                cable=cables[min(index, len(cables) - 1)],
+                max_current=options.max_current,
+                min_current=options.min_current,
+                mode=options.mode,
+                serial=options.serial + index,
+                unit=options.unit,
+                override_works=not options.no_override,
+                turn_round=options.turn_round,
+            )
+        )
+    return boxes
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="virtual-chargers",
@@ -182,6 +210,27 @@ def _parser() -> argparse.ArgumentParser:
     add("--min-current", type=float, default=6.0, metavar="A")
     add("--min-interval", type=int, default=1, metavar="S")
     add("--commands", type=int, nargs="+", default=[68, 69], choices=[68, 69])
+    smartevse = kinds.add_parser("smartevse", help="SmartEVSE v2 boxes")
+    _common(smartevse.add_argument)
+    add = smartevse.add_argument
+    add("--dialect", choices=list(DIALECTS), default="2.17", help="the firmware")
+    add(
+        "--load-balance",
+        type=int,
+        nargs="+",
+        default=[0],
+        metavar="N",
+        help="a box each: 0 off, 1 master, 2 to 8 slaves; it is also the address",
+    )
+    add("--unit", type=int, help="address with load balancing off, if not the usual")
+    add("--cables", type=int, nargs="+", default=[16], choices=[13, 16, 32, 63])
+    add("--fixed-cable", action="store_true", help="no socket: --max-current holds")
+    add("--max-current", type=int, default=13, metavar="A")
+    add("--min-current", type=int, default=6, metavar="A")
+    add("--mode", type=int, choices=[0, 1, 2], default=0, help="normal, smart, solar")
+    add("--serial", type=int, default=1, help="of the first box; dialect later only")
+    add("--no-override", action="store_true", help="ignores a charging current")
+    add("--turn-round", type=float, default=0.01, metavar="S")
     return parser
 
 
@@ -210,7 +259,7 @@ def _common(add: Callable[..., object]) -> None:
     )
     add("--granularity", type=float, default=0.002, help="seconds a chunk of a reply")
     add("--seed", type=int, default=0)
-    add("--dead", type=int, nargs="+", default=[], help="IDs or serials that are dead")
+    add("--dead", type=int, nargs="+", default=[], help="IDs, units or serials")
     add("--error-rate", type=float, default=0.0, help="a byte's chance to be damaged")
     add("--lose-rate", type=float, default=0.0, help="a reply's chance to be lost")
     add("--late-rate", type=float, default=0.0, help="a reply's chance to be late")

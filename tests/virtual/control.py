@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from .abl import AblBox
 from .evbox import EvboxChargePoint
+from .smartevse import SmartEvse
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 HELP = (
     "plug|request|finish|leave ID[.MODULE]; dead|alive|power-cycle ID;"
     " fail ID N; clear ID; stop|start ID; others ID A;"
+    " press ID; menu ID SETTING N; temperature ID C;"
     " unplug-adapter; replug-adapter; advance S; status"
 )
 
@@ -62,8 +64,12 @@ class Control:
     def _device_command(self, word: str, device: Device, values: list[str]) -> None:
         if word in ("dead", "alive"):
             device.faults.dead = word == "dead"
-        elif word == "power-cycle" and isinstance(device, AblBox | EvboxChargePoint):
+        elif word == "power-cycle" and isinstance(
+            device, AblBox | EvboxChargePoint | SmartEvse
+        ):
             device.power_cycle()
+        elif isinstance(device, SmartEvse):
+            self._smartevse_command(word, device, values)
         elif not isinstance(device, AblBox):
             msg = f"{word} is nothing for {device.name}"
             raise TypeError(msg)
@@ -81,9 +87,24 @@ class Control:
             msg = f"no such command; there are: {HELP}"
             raise ValueError(msg)
 
+    def _smartevse_command(
+        self, word: str, device: SmartEvse, values: list[str]
+    ) -> None:
+        if word == "press":
+            device.press_access()
+        elif word == "menu":
+            device.set_at_the_box(values[0], int(values[1]))
+        elif word == "temperature":
+            device.outlet.temperature = int(values[0])
+        else:
+            msg = f"no such command; there are: {HELP}"
+            raise ValueError(msg)
+
     def _device(self, key: str) -> Device:
         for device in self._bus.devices:
             if isinstance(device, AblBox) and device.device_id == int(key):
+                return device
+            if isinstance(device, SmartEvse) and device.unit == int(key):
                 return device
             if isinstance(device, EvboxChargePoint) and int(device.serial) == int(key):
                 return device
@@ -96,6 +117,8 @@ class Control:
         car = None
         if isinstance(device, AblBox):
             car = device.outlet.car
+        elif isinstance(device, SmartEvse):
+            car = device.car
         elif isinstance(device, EvboxChargePoint):
             car = device.modules[int(module or 1) - 1].car
         if car is None:
@@ -126,5 +149,13 @@ def describe(bus: VirtualBus) -> str:
             lines.append(
                 f"  {device.name}{dead}: limits {limits} A{back}, draws {draws},"
                 f" {device.counters.accepted} orders"
+            )
+        elif isinstance(device, SmartEvse):
+            closed = "closed" if device.contactor else "open"
+            access = "" if device.access else ", no access"
+            lines.append(
+                f"  {device.name}{dead}: {device.state}, error {device.error}{access},"
+                f" offers {device.pilot_current:.1f} A, contactor {closed},"
+                f" draws {device.car_current:.1f} A, {device.requests} requests"
             )
     return "\n".join(lines)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections import Counter
 
     from .car import Car
-    from .smartevse_controller import BalanceBroadcast, Handshake, RegisterWrite
+    from .smartevse_history import BalanceBroadcast, Handshake, RegisterWrite
     from .smartevse_outlet import SmartEvseOutlet
     from .wire import Segment
 

@@ -7,7 +7,6 @@ works where time is simulated.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from .smartevse_frames import (
@@ -23,8 +22,10 @@ from .smartevse_frames import (
     write_frame,
     write_several_frame,
 )
-from .smartevse_outlet import COMM_TIMEOUT, SmartEvseOutlet, pwm_of
+from .smartevse_history import BalanceBroadcast, Handshake, RegisterWrite
+from .smartevse_outlet import COMM_TIMEOUT, SmartEvseOutlet
 from .smartevse_registers import MASTER, NO_CURRENT, NORMAL, Setting
+from .smartevse_states import pwm_of
 
 if TYPE_CHECKING:
     from .car import Car
@@ -36,40 +37,6 @@ ACKNOWLEDGEMENTS = range(0x81, 0x85)
 REQUESTS = range(0x01, 0x05)
 KELVIN = 273
 VOLATILE_MODE_2_17 = 0xA8
-
-
-@dataclass(frozen=True, slots=True)
-class RegisterWrite:
-    """A write that the box understood: when (its time), what, and what became of it.
-
-    `taken`: how many registers took their value, by the box's own count; the override
-    of a 2.17 is taken although it does not count.
-    """
-
-    t: float
-    unit: int
-    function: int
-    register: int
-    values: tuple[int, ...]
-    taken: int
-    answered: bool
-
-
-@dataclass(frozen=True, slots=True)
-class BalanceBroadcast:
-    """Charge currents heard from a master: when (box's time), and 0.1 A per unit."""
-
-    t: float
-    currents: tuple[int, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Handshake:
-    """A request of a slave (01 to 04) or an acknowledgement (81 to 84), box's time."""
-
-    t: float
-    register: int
-    value: int
 
 
 class SmartEvseController:
@@ -102,6 +69,7 @@ class SmartEvseController:
         self.broadcasts: list[BalanceBroadcast] = []
         self.requests_sent: list[Handshake] = []
         self.answers: list[Handshake] = []
+        self.slave_requests: list[tuple[int, Handshake]] = []
         self.config_changed = 0
         self.dropped = 0
         self.ignored = 0
@@ -139,10 +107,13 @@ class SmartEvseController:
 
     def _broadcast(self) -> None:
         """As a master: say what everybody may draw."""
-        currents = [self.outlet.current] + [0] * (self.dialect.units - 1)
+        sharing = self.outlet.sharing
+        sharing.currents[0] = self.outlet.current
         self._say_request(
             write_several_frame(
-                self.dialect.broadcast_unit, self.dialect.balance_register, *currents
+                self.dialect.broadcast_unit,
+                self.dialect.balance_register,
+                *sharing.currents,
             )
         )
 
@@ -184,6 +155,8 @@ class SmartEvseController:
         return True
 
     def _obey(self, packet: Packet) -> bytes | None:
+        if self._acknowledge(packet):
+            return None
         own = packet.unit == self.unit
         if packet.function in READS:
             return self._read(packet) if own else None
@@ -192,7 +165,8 @@ class SmartEvseController:
         if packet.function == WRITE_SEVERAL and self._balance(packet):
             return None
         if packet.register in self.dialect.silent:
-            return self._handshake(packet)
+            self._handshake(packet)
+            return None
         return self._write(packet)
 
     def _hidden(self, packet: Packet) -> bool:
@@ -357,6 +331,19 @@ class SmartEvseController:
             out.go("C1" if self.dialect.gentle else "A")
         elif out.state in ("B", "C"):
             out.pilot_current = pwm_of(out.current)
+        return True
+
+    def _acknowledge(self, packet: Packet) -> bool:
+        """As a master of 2.17: answer a slave's request; tell whether it was one."""
+        if self.outlet.load_balance != MASTER or self.dialect.status_writable:
+            return False
+        slave = MASTER < packet.unit <= self.dialect.units
+        if not slave or packet.function != WRITE_ONE or packet.register not in REQUESTS:
+            return False
+        asked = Handshake(self.now, packet.register, packet.values[0])
+        self.slave_requests.append((packet.unit, asked))
+        value = self.outlet.sharing.answer(packet.unit, asked.register, asked.value)
+        self._say_request(write_frame(packet.unit, 0x80 | asked.register, value))
         return True
 
     def _handshake(self, packet: Packet) -> None:

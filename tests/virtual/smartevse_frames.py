@@ -7,12 +7,11 @@ heard last.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from .bus import VirtualBus
     from .log import Entry
 
@@ -150,8 +149,7 @@ def smartevse_requests_in(
     `bus.log.bursts("injected")`. Frames with 3 ms or less between them are one piece of
     nonsense, to a box and here.
     """
-    log = getattr(traffic, "log", None)
-    entries = log.bursts(gap=FRAME_GAP) if log is not None else traffic
+    entries = traffic if isinstance(traffic, Iterable) else traffic.log.bursts()
     result = []
     for entry in entries:
         packet = decode(entry.data, (*READS, WRITE_ONE, WRITE_SEVERAL))

@@ -1,0 +1,361 @@
+"""The states of a virtual SmartEVSE v2, and what the pilot does to them. No clock.
+
+Written from the manual, the recorded trace, and the facts in the README.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from .smartevse_registers import (
+    DISABLED,
+    LESS_6A,
+    MASTER,
+    NO_CURRENT,
+    NO_SUN,
+    NORMAL,
+    RCD,
+    SOLAR,
+    Dialect,
+)
+from .smartevse_sharing import Sharing
+
+if TYPE_CHECKING:
+    from .car import Car
+
+# Times in seconds of the devices' time.
+DEBOUNCE = 0.01
+CABLE_MEASUREMENT = 0.09
+ACK_TIMEOUT = 0.98
+CHARGE_DELAY = 60
+STOP_DELAY = 15
+B1_DELAY = 3
+C1_TIME = 6
+START_TIMEOUT = 5
+ACTIVATION_AFTER = 30
+ACTIVATION_TIME = 3
+LOWEST_PWM, HIGHEST_PWM = 60, 800
+UNPLUGGED, CONNECTED, CHARGING = 12, 9, 6
+NEVER = 255
+
+WAITING = {"E": 0x01, "F": 0x02, "G": 0x03, "H": 0x04}
+
+
+def pwm_of(tenths: int) -> float:
+    """Return what the pilot signals, A, for a current in 0.1 A: nonsense is 6 A."""
+    return (tenths if LOWEST_PWM <= tenths <= HIGHEST_PWM else LOWEST_PWM) / 10
+
+
+class SmartEvseStates:
+    """One outlet without a clock of its own. Plain attributes may be set anywhere, at any time.
+
+    - `settings`: the stored settings by name; `override` and `current` in 0.1 A
+    - `access`, `error` (bits), `state`, `contactor` (closed or not)
+    - `pilot_current`: what the pilot signals, A; 0 = no PWM
+    - `pilot_voltage`: 12, 9 or 6 = what the pilot shows, in place of the car's doing
+    - `temperature` in degrees; `meter_works`, `meter_leaves` (A) of its mains meter,
+      which it has in the modes smart and solar
+    """
+
+    def __init__(
+        self,
+        dialect: Dialect,
+        car: Car | None = None,
+        *,
+        cable: int = 16,
+        settings: dict[str, int] | None = None,
+    ) -> None:
+        """Make an outlet that was just switched on."""
+        self.dialect = dialect
+        self.car = car
+        self.cable = cable
+        self.settings = {n: s.default for n, s in dialect.settings.items()}
+        self.settings.update(settings or {})
+        self.pilot_voltage: int | None = None
+        self.temperature = 20
+        self.rcd_tripped = False
+        self.meter_works = True
+        self.meter_leaves = 80.0
+        self.switch_closed = True
+        self.stored = dict(self.settings)
+        self.car_current = 0.0
+        self.energy_wh = 0.0
+        # (register, value) to send: of a slave to its own address.
+        self.asked: list[tuple[int, int]] = []
+        self.error_broadcasts: list[int] = []
+        self.cycles = 0
+        self._now: float | None = None
+        self.power_up()
+
+    def power_up(self) -> None:
+        """Begin with what is stored: volatile things are forgotten."""
+        self.settings = dict(self.stored)
+        self.state = "A"
+        self.access = False
+        self.error = 0
+        self.contactor = False
+        self.pilot_current = 0.0
+        self.cable_measured = 0
+        self.phases = 0
+        self.override = 0
+        self.current = 0
+        self.charge_delay = 0
+        self.solar_timer = 0
+        self.comm_timeout = START_TIMEOUT
+        self.external_master = 0
+        self.sharing = Sharing(self, self.dialect.units)
+        self._cycle = 0
+        self._wanted = 0
+        self._next = ""
+        self._next_since = 0.0
+        self._asked_at = float("-inf")
+        self._second_at: float | None = None
+        self._cycle_at: float | None = None
+        self._c1_timer = 0
+        self._activation = NEVER
+        self._activation_timer = 0
+        self.open_access()
+
+    # Facts
+
+    @property
+    def load_balance(self) -> int:
+        """Return the load-balance setting, which is also the address."""
+        return self.settings["load_balance"]
+
+    @property
+    def disabled(self) -> bool:
+        """Tell whether load balancing is off."""
+        return self.load_balance == DISABLED
+
+    @property
+    def slave(self) -> bool:
+        """Tell whether a master says what may be drawn."""
+        return self.load_balance > MASTER
+
+    @property
+    def own_maximum(self) -> int:
+        """Return min(configured, cable) in 0.1 A, as it asks for it."""
+        return 10 * min(self.settings["max_current"], self.cable_measured)
+
+    @property
+    def pilot(self) -> int:
+        """Return the pilot's voltage: 12 nobody, 9 connected, 6 asking."""
+        if self.pilot_voltage is not None:
+            return self.pilot_voltage
+        car = self.car
+        if car is None or not car.plugged:
+            return UNPLUGGED
+        if self.pilot_current > 0:
+            return CHARGING if car.accepts(self.pilot_current) else CONNECTED
+        holds = car.requesting and car.asks_without_pwm
+        return CHARGING if holds or car.current > 0 else CONNECTED
+
+    def open_access(self) -> None:
+        """Open access unless a switch decides; every save of settings does it."""
+        if self.settings["switch"] not in (1, 2):
+            self.access = True
+
+    # What others do to it
+
+    def set_access(self, allowed: bool) -> None:  # noqa: FBT001 - a register's value
+        """Set the access bit."""
+        self.access = allowed
+        if allowed:
+            return
+        if not self.dialect.gentle:
+            self.go("A")
+        elif self.state in ("B", "C"):
+            self.go("C1" if self.state == "C" else "B1")
+
+    def set_error(self, bits: int) -> None:
+        """Take over error bits from a master: any of them stops the charge."""
+        self.error = bits
+        if bits:
+            self.stop()
+            self.charge_delay = CHARGE_DELAY
+
+    def stop(self) -> None:
+        """Stop because of an error."""
+        if not self.dialect.gentle:
+            self.go("A")
+        elif self.state != "C1":
+            self.go("C1" if self.state == "C" else "B1")
+
+    def press(self) -> None:
+        """Press the button, or move the switch, at the box."""
+        switch = self.settings["switch"]
+        if switch == 1:
+            self.set_access(not self.access)
+        elif switch == 2:
+            self.switch_closed = not self.access
+            self.set_access(self.switch_closed)
+        elif self.state == "C":
+            self.go("C1" if self.dialect.gentle else "A")
+            self.charge_delay = STOP_DELAY
+        if not self.rcd_tripped:
+            self.error &= ~RCD
+
+    def go(self, state: str) -> None:
+        """Change the state and do what belongs to it at once."""
+        self.state = state
+        self._next = ""
+        if state in ("A", "B1"):
+            self.contactor = False
+            self.pilot_current = 0.0
+        if state == "C":
+            self.contactor = True
+            self._activation = NEVER
+        if not self.dialect.gentle:
+            return
+        if state == "A":
+            self.error &= ~(NO_SUN | LESS_6A)
+            self.charge_delay = 0
+        elif state == "B1":
+            self.charge_delay = self.charge_delay or B1_DELAY
+        elif state == "C1":
+            self.pilot_current = 0.0
+            self._c1_timer = C1_TIME
+            self.charge_delay = STOP_DELAY
+
+    # The pilot
+
+    def _lasts(self, target: str, now: float, seconds: float) -> bool:
+        if self._next != target:
+            self._next = target
+            self._next_since = now
+        return now - self._next_since >= seconds
+
+    def _follow_pilot(self, now: float) -> None:
+        """Do what the pilot's voltage asks for."""
+        pilot = self.pilot
+        if self.state in ("A", "B1") or (
+            self.state == "F" and self.dialect.status_writable
+        ):
+            self._in_a(pilot, now)
+        elif self.state == "B" or (self.state == "G" and self.dialect.status_writable):
+            self._in_b(pilot, now)
+        elif self.state == "C":
+            self._in_c(pilot, now)
+        elif self.state == "C1":
+            if pilot == UNPLUGGED and self._lasts("A", now, DEBOUNCE):
+                self.go("A")
+            elif pilot == CONNECTED and self._lasts("B1", now, DEBOUNCE):
+                self.go("B1")
+        elif self.state in WAITING:
+            self._wait(now)
+
+    def _in_a(self, pilot: int, now: float) -> None:
+        if pilot == UNPLUGGED:
+            if self.state != "A":
+                self.go("A")
+            self.error &= ~(NO_SUN | LESS_6A)
+            self.charge_delay = 0
+            self._next = ""
+            return
+        ready = self.access and not self.error and not self.charge_delay
+        if self.state == "F" or pilot != CONNECTED or not ready:
+            self._next = ""
+        elif self._lasts("B", now, DEBOUNCE + CABLE_MEASUREMENT):
+            fixed = self.settings["config"]
+            self.cable_measured = self.settings["max_current"] if fixed else self.cable
+            self._wanted = self.own_maximum
+            if self.slave:
+                self._ask("F", now)
+            elif not self.dialect.gentle or self._enough():
+                self.current = self._wanted
+                self.enter_b()
+            else:
+                self._lack()
+
+    def enter_b(self) -> None:
+        """Go to B; the cycle or a broadcast starts the PWM."""
+        self.go("B")
+        self._activation = ACTIVATION_AFTER
+
+    def _in_b(self, pilot: int, now: float) -> None:
+        if pilot == UNPLUGGED:
+            if self._lasts("A", now, DEBOUNCE):
+                self._leave(now)
+        elif pilot == CHARGING:
+            ready = not self.error and not self.charge_delay and self.state == "B"
+            if self._lasts("C", now, DEBOUNCE) and ready:
+                if self.slave:
+                    self._ask("G", now)
+                elif self._enough():
+                    self.go("C")
+                    self._recalculate()
+                else:
+                    self._lack()
+        else:
+            self._next = ""
+            if self._activation == 0:
+                self.go("T")
+                self.pilot_current = 0.0
+                self._activation_timer = ACTIVATION_TIME
+
+    def _in_c(self, pilot: int, now: float) -> None:
+        if pilot == UNPLUGGED:
+            if self._lasts("A", now, DEBOUNCE):
+                self.contactor = False
+                self._leave(now)
+        elif pilot == CONNECTED:
+            if self._lasts("B", now, DEBOUNCE):
+                self.contactor = False
+                if self.slave and not self.dialect.status_writable:
+                    self._ask("H", now)
+                else:
+                    self.go("B")
+        else:
+            self._next = ""
+
+    def _leave(self, now: float) -> None:
+        if self.slave and not self.dialect.status_writable:
+            self._ask("E", now)
+        else:
+            self.go("A")
+
+    def _ask(self, waiting: str, now: float) -> None:
+        """Ask the master, and wait; later dialects wait to be read."""
+        self.state = waiting
+        self._next = ""
+        self._asked_at = now
+        if not self.dialect.status_writable:
+            register = WAITING[waiting]
+            value = self._wanted if waiting in ("F", "G") else 0
+            self.asked.append((register, value))
+
+    def _wait(self, now: float) -> None:
+        if self.dialect.status_writable or now - self._asked_at <= ACK_TIMEOUT:
+            return
+        if self.state == "F":
+            self.go("A")
+        elif self.state == "G":
+            self.go("B")
+        else:
+            self._ask(self.state, now)
+
+    def _lack(self) -> None:
+        """Say that there is not enough; the 2.17 waits with the reason."""
+        lacking = NO_SUN if self.settings["mode"] == SOLAR else LESS_6A
+        self.error |= lacking if self.dialect.status_writable else NO_CURRENT
+
+    def _enough(self) -> bool:
+        """Tell whether there is enough to begin with, for its meter and as a master."""
+        if self.load_balance == MASTER and not self.sharing.available():
+            return False
+        return self._meter_leaves_enough()
+
+    def _meter_leaves_enough(self) -> bool:
+        normal = self.settings["mode"] == NORMAL
+        return normal or self.meter_leaves >= self.settings["min_current"]
+
+    def _recalculate(self) -> None:
+        """Take over the override, or the maximum, while charging."""
+        charge = self.override or self.own_maximum
+        if self.load_balance == MASTER:
+            charge = self.sharing.split(charge)
+        elif self.settings["mode"] != NORMAL:
+            charge = min(charge, int(self.meter_leaves * 10))
+        if self.state == "C":
+            self.current = charge
