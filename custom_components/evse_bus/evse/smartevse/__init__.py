@@ -1,0 +1,1 @@
+"""SmartEVSE v2: Modbus RTU on RS-485."""
