@@ -67,7 +67,13 @@ class VirtualBus(LoopThread):
         self.faults = Faults()
         self.log = TrafficLog(ring)
         self.devices: list[Device] = []
-        self.wire = Wire(self.byte_time, granularity, self.faults, self.rng)
+        self.wire = Wire(
+            self.byte_time,
+            granularity,
+            self.faults,
+            self.rng,
+            duplex=any(device.duplex for device in devices),
+        )
         self._make_port = make_port
         self._port: Port | None = None
         self._url = ""

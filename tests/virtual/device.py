@@ -42,6 +42,8 @@ class Device:
     protocol: ClassVar[str] = "device"
     # The silence before a request that the protocol asks of everybody, in seconds.
     silence_rule: ClassVar[float] = 0.0
+    # A wire for each direction (RS-232), or one for both (RS-485).
+    duplex: ClassVar[bool] = False
 
     def __init__(self, name: str) -> None:
         """Make a device with a name; the bus makes it unique."""

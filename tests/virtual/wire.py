@@ -73,9 +73,16 @@ class Wire:
         granularity: float,
         faults: Faults,
         rng: Random,
+        *,
+        duplex: bool = False,
     ) -> None:
-        """Make a silent wire; `attach` gives it a loop and ears."""
+        """Make a silent wire; `attach` gives it a loop and ears.
+
+        With `duplex` (RS-232) there is a wire for each direction: the client's bytes
+        and the devices' do not disturb each other.
+        """
         self.byte_time = byte_time
+        self.duplex = duplex
         self.faults = faults
         self.collisions = 0
         self.bytes_carried = 0
@@ -211,7 +218,7 @@ class Wire:
     def _step(self, now: float) -> bool:
         """Carry the earliest bytes; False if none is complete by now."""
         first = min(self._active, key=lambda t: t.next_start)
-        others = [t for t in self._active if t is not first]
+        others = [t for t in self._active if t is not first and self._meet(t, first)]
         bt = first.byte_time
         complete = int((now - first.start) / bt)
         complete = min(complete, len(first.data)) - first.position
@@ -231,6 +238,10 @@ class Wire:
             return True
         self._collide(first, others, start)
         return True
+
+    def _meet(self, one: Transmission, other: Transmission) -> bool:
+        """Tell whether two transmissions use the same wire."""
+        return not self.duplex or (one.source == CLIENT) == (other.source == CLIENT)
 
     def _collide(
         self, first: Transmission, others: list[Transmission], start: float
@@ -253,7 +264,8 @@ class Wire:
 
     def _hear(self, start: float, data: bytes, sources: tuple[str, ...]) -> None:
         silence = start - self._last_end
-        self._last_end = start + len(data) * self.byte_time
+        # On two wires the other direction may already be further.
+        self._last_end = max(self._last_end, start + len(data) * self.byte_time)
         self.bytes_carried += len(data)
         if sources != (CLIENT,) or self.faults.echo:
             self._to_client += data
