@@ -299,7 +299,7 @@ class SmartEvseController:
             names = {code: name for name, code in self.dialect.states.items()}
             state = names.get(value, "A")
             # "Granted": the node goes on by itself.
-            out.go({"F": "B", "H": "C"}.get(state, state))
+            out.go({"F+": "B", "G+": "C"}.get(state, state))
         elif item == "error":
             out.set_error(value)
         elif item == "solar_timer":

@@ -129,7 +129,8 @@ _CUSTOM_2_20 = _custom(
     "energy",
     "energy_divisor",
 )
-_LETTERS = ("A", "B", "C", "D", "E", "F", "G", "H")
+# F and G wait for the master, for B and C; with a + he has granted it.
+_LATER_STATES = ("A", "B", "C", "D", "F", "F+", "G", "G+", "T", "B1", "C1")
 
 V2_17 = Dialect(
     name="2.17",
@@ -139,7 +140,7 @@ V2_17 = Dialect(
     balance_register=0x01,
     units=4,
     # E to H wait for the master: E for A, F for B, G for C, H for C to B.
-    states={letter: ord(letter) for letter in (*_LETTERS, "T")},
+    states={letter: ord(letter) for letter in "ABCDEFGHT"},
     blocks=(
         Block(
             0xA0,
@@ -197,7 +198,7 @@ V2_20 = Dialect(
     broadcast_unit=9,
     balance_register=0x01,
     units=8,
-    states={letter: index for index, letter in enumerate((*_LETTERS, "T"))},
+    states={name: index for index, name in enumerate(_LATER_STATES[:9])},
     blocks=(
         Block(
             0xA0,
@@ -261,7 +262,7 @@ LATER = Dialect(
     broadcast_unit=9,
     balance_register=0x20,
     units=8,
-    states={letter: index for index, letter in enumerate((*_LETTERS, "T", "B1", "C1"))},
+    states={name: index for index, name in enumerate(_LATER_STATES)},
     blocks=(
         Block(
             0x0000,

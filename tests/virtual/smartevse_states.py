@@ -79,6 +79,7 @@ class SmartEvseStates:
         self.switch_closed = True
         self.stored = dict(self.settings)
         self.car_current = 0.0
+        self._offered = False
         self.energy_wh = 0.0
         # (register, value) to send: of a slave to its own address.
         self.asked: list[tuple[int, int]] = []
@@ -145,10 +146,12 @@ class SmartEvseStates:
             return self.pilot_voltage
         car = self.car
         if car is None or not car.plugged:
+            self._offered = False
             return UNPLUGGED
         if self.pilot_current > 0:
+            self._offered = True
             return CHARGING if car.accepts(self.pilot_current) else CONNECTED
-        holds = car.requesting and car.asks_without_pwm
+        holds = car.requesting and car.asks_without_pwm and self._offered
         return CHARGING if holds or car.current > 0 else CONNECTED
 
     def open_access(self) -> None:

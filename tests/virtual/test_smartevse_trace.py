@@ -17,9 +17,8 @@ import pytest
 from .bus import VirtualBus
 from .raw_client import RawClient
 from .smartevse import SmartEvse
-from .smartevse_controller import SmartEvseController
+from .smartevse_alone import SmartEvseAlone
 from .smartevse_frames import write_several_frame
-from .smartevse_registers import V2_17
 
 TRACE: dict[str, list[dict[str, Any]]] = json.loads(
     (Path(__file__).parents[1] / "traces" / "smartevse_v2_17.json").read_text()
@@ -53,37 +52,26 @@ PILOT_SLAVE = {
 }
 
 
-class Recording:
-    """A controller in its own time, and what it sent when."""
+class Recording(SmartEvseAlone):
+    """A box in its own time, with hex as in the trace."""
 
     def __init__(self, load_balance: int) -> None:
-        self.box = SmartEvseController(V2_17, settings={"load_balance": load_balance})
-        self.box.outlet.pilot_voltage = 12
-        self.now = 0.0
-        self.sent: list[tuple[float, str]] = []
-        self.box.step(self.now)
+        super().__init__("2.17", load_balance=load_balance)
+        self.outlet.pilot_voltage = 12
 
-    def live(self, seconds: float) -> None:
-        end = self.now + seconds
-        while self.now < end - 1e-9:
-            self.now = min(end, self.now + 0.01)
-            self.box.step(self.now)
-            self.collect()
-
-    def collect(self) -> None:
-        self.sent += [(self.now, frame.hex()) for frame in self.box.sending]
-        self.box.sending.clear()
-
-    def hear(self, request: str) -> str | None:
-        answer = self.box.receive(bytes.fromhex(request), self.now)
-        self.collect()
+    def hear_hex(self, request: str) -> str | None:
+        answer = self.hear(bytes.fromhex(request))
         return answer.hex() if answer else None
+
+    @property
+    def sent_hex(self) -> list[tuple[float, str]]:
+        return [(t, data.hex()) for t, data in self.sent]
 
     def heard_alone(self, seconds: float) -> list[tuple[float, str]]:
         """Listen; return what it sent, with times from the beginning."""
         begin, before = self.now, len(self.sent)
         self.live(seconds)
-        return [(t - begin, frame) for t, frame in self.sent[before:]]
+        return [(t - begin, frame) for t, frame in self.sent_hex[before:]]
 
 
 def frames_of(lumps: list[tuple[float, str]]) -> list[tuple[float, str]]:
@@ -112,16 +100,16 @@ def replay(record: Recording, entries: list[dict[str, Any]]) -> Iterator[str]:
     for entry in entries:
         what = entry["what"]
         if "unsolicited" in entry:
-            record.box.outlet.pilot_voltage = PILOT_SLAVE.get(
-                what, record.box.outlet.pilot_voltage
+            record.outlet.pilot_voltage = PILOT_SLAVE.get(
+                what, record.outlet.pilot_voltage
             )
             want = frames_of([(t, data) for t, data in entry["unsolicited"]])
             assert_alike(record.heard_alone(LISTENED[what]), want, 0.05)
         else:
             pilot, seconds = BEFORE_NORMAL.get(what, (None, 0.0))
-            record.box.outlet.pilot_voltage = pilot or record.box.outlet.pilot_voltage
+            record.outlet.pilot_voltage = pilot or record.outlet.pilot_voltage
             record.live(seconds)
-            assert record.hear(entry["request"]) == entry["reply"], what
+            assert record.hear_hex(entry["request"]) == entry["reply"], what
             record.live(EXCHANGE)
         yield what
 
@@ -140,7 +128,7 @@ def test_master() -> None:
 def test_slave() -> None:
     """Also how the acknowledged slave got to state A: nobody broadcast for 10 s."""
     record = Recording(2)
-    out = record.box.outlet
+    out = record.outlet
     seen: dict[str, list[tuple[str, bool, int]]] = {}
     for what in replay(record, TRACE["slave"]):
         seen.setdefault(what, []).append((out.state, out.contactor, out.error))
@@ -159,13 +147,13 @@ def test_slave_with_master() -> None:
     for entry in sections:
         record.live(max(0.0, entry["t"] - record.now))
         if entry.get("event") in pilots:
-            record.box.outlet.pilot_voltage = pilots[entry["event"]]
+            record.outlet.pilot_voltage = pilots[entry["event"]]
         elif entry.get("dir") == "master":
-            answer = record.hear(entry["hex"])
+            answer = record.hear_hex(entry["hex"])
             if answer:
                 answers.append((record.now, answer))
     record.live(1.0)
-    got = sorted(answers + record.sent)
+    got = sorted(answers + record.sent_hex)
     want = [(e["t"], e["hex"]) for e in sections if e.get("dir") == "slave"]
     assert [frame for _, frame in got] == [frame for _, frame in want]
     for (t, _), (recorded, _) in zip(got, want, strict=True):
@@ -200,7 +188,7 @@ def test_slave_stop_and_resume() -> None:
         while next_broadcast <= end:
             record.live(max(0.0, next_broadcast - record.now))
             broadcast = write_several_frame(0, 1, 0, limit, 0, 0)
-            assert record.hear(broadcast.hex()) is None
+            assert record.hear_hex(broadcast.hex()) is None
             next_broadcast += 2.0
         record.live(max(0.0, end - record.now))
 
@@ -209,16 +197,16 @@ def test_slave_stop_and_resume() -> None:
         if what not in done:
             done.add(what)
             pilot, current, seconds = BEFORE_RESUME.get(what, (None, None, 0.0))
-            record.box.outlet.pilot_voltage = pilot or record.box.outlet.pilot_voltage
+            record.outlet.pilot_voltage = pilot or record.outlet.pilot_voltage
             limit = limit if current is None else current
             live(seconds)
         if "slave_sent" in entry:
-            assert [frame for _, frame in record.sent] == [entry["slave_sent"]]
+            assert [frame for _, frame in record.sent_hex] == [entry["slave_sent"]]
             record.sent.clear()
         elif "master_ack" in entry:
-            assert record.hear(entry["master_ack"]) is None
+            assert record.hear_hex(entry["master_ack"]) is None
         else:
-            assert record.hear(entry["request"]) == entry["reply"], what
+            assert record.hear_hex(entry["request"]) == entry["reply"], what
             live(EXCHANGE)
     assert record.sent == []
     assert done >= set(BEFORE_RESUME)
