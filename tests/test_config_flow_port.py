@@ -14,6 +14,7 @@ from pytest_homeassistant_custom_component.common import MockConfigEntry
 from custom_components.evse_bus.config_flow import EvseBusConfigFlow
 from custom_components.evse_bus.const import DOMAIN
 from custom_components.evse_bus.evse.protocols import PROTOCOLS
+from custom_components.evse_bus.flow_schema import MAKES
 from custom_components.evse_bus.subentry_flow import ChargerSubentryFlow
 from tests.flow import IMPOSED, NOWHERE, charger, english, port_step
 from tests.virtual import (
@@ -161,6 +162,8 @@ def test_every_text_belongs_to_a_step() -> None:
 
 def test_protocols_say_how_they_use_the_line() -> None:
     labels = english()["selector"]["protocol"]["options"]
-    assert labels.keys() == PROTOCOLS.keys()
-    for key, protocol in PROTOCOLS.items():
-        assert str(protocol.settings) in labels[key]
+    assert labels.keys() == MAKES.keys()
+    for make, protocols in MAKES.items():
+        for key in protocols:
+            assert str(PROTOCOLS[key].settings) in labels[make]
+    assert sorted(PROTOCOLS) == sorted(key for keys in MAKES.values() for key in keys)

@@ -22,6 +22,7 @@ from .const import (
     CONF_FAIL_SAFE_TIMEOUT,
     CONF_INSTALLATION_LIMIT,
     CONF_PROTOCOL,
+    CONF_SUPPLY_LIMIT,
     DOMAIN,
     SUBENTRY_CHARGER,
 )
@@ -41,6 +42,8 @@ from .flow_scan import (
     port_name,
 )
 from .flow_schema import (
+    MAKES,
+    SUGGESTED_LIMIT,
     bus_data,
     check_impose,
     impose_form,
@@ -49,6 +52,7 @@ from .flow_schema import (
     protocol_form,
 )
 from .flow_steps import ChargerSteps
+from .flow_supply import check_supply, supply_data, supply_form
 from .setup import line_settings, protocol_of
 from .subentry_flow import ChargerSubentryFlow
 
@@ -64,7 +68,7 @@ class EvseBusConfigFlow(
     VERSION = 1
     MINOR_VERSION = 1
 
-    several = True
+    at_once = True
     step_after_error = "port"
 
     def __init__(self) -> None:
@@ -87,11 +91,37 @@ class EvseBusConfigFlow(
     async def async_step_user(
         self, user_input: dict[str, Any] | None = None
     ) -> ConfigFlowResult:
-        """Choose the protocol."""
+        """Choose what chargers they are."""
         if user_input is not None:
-            self.protocol = PROTOCOLS[user_input[CONF_PROTOCOL]]
+            protocols = MAKES[user_input[CONF_PROTOCOL]]
+            if len(protocols) > 1:
+                return await self.async_step_mode()
+            self.protocol = PROTOCOLS[protocols[0]]
             return await self.async_step_port()
         return self.async_show_form(step_id="user", data_schema=protocol_form())
+
+    async def async_step_mode(
+        self,
+        user_input: dict[str, Any] | None = None,  # noqa: ARG002 - a step's signature
+    ) -> ConfigFlowResult:
+        """Choose what Home Assistant is to a SmartEVSE; say what happens without it."""
+        return self.async_show_menu(step_id="mode", menu_options=["polled", "master"])
+
+    async def async_step_polled(
+        self,
+        user_input: dict[str, Any] | None = None,  # noqa: ARG002
+    ) -> ConfigFlowResult:
+        """Poll one box."""
+        self.protocol = PROTOCOLS["smartevse"]
+        return await self.async_step_port()
+
+    async def async_step_master(
+        self,
+        user_input: dict[str, Any] | None = None,  # noqa: ARG002
+    ) -> ConfigFlowResult:
+        """Be the load-balancing master of several boxes."""
+        self.protocol = PROTOCOLS["smartevse_master"]
+        return await self.async_step_port()
 
     async def async_step_port(
         self, user_input: dict[str, Any] | None = None
@@ -104,6 +134,8 @@ class EvseBusConfigFlow(
                 if self.protocol.probe_imposes:
                     return await self.async_step_impose()
                 self._searches = nothing_imposed(self.protocol)
+                if self.protocol.duty is not None:
+                    return await self.async_step_supply()
                 return await self.async_step_scan()
         usual = self.protocol.settings
         return self.async_show_form(
@@ -144,6 +176,31 @@ class EvseBusConfigFlow(
                 return {}
         error = await async_try_port(device, line_settings(self.bus_data))
         return {"base": error} if error else {}
+
+    # -- What all chargers share, where Home Assistant is their master -----------
+
+    async def async_step_supply(
+        self, user_input: dict[str, Any] | None = None
+    ) -> ConfigFlowResult:
+        """Ask what all chargers may draw together."""
+        errors: Errors = {}
+        if user_input is not None:
+            errors = check_supply(user_input)
+            if not errors:
+                supply = supply_data(user_input)
+                self.bus_data |= supply
+                # No single one gets more than all of them share.
+                limit = min(SUGGESTED_LIMIT, supply[CONF_SUPPLY_LIMIT])
+                self.suggestions |= supply | {CONF_INSTALLATION_LIMIT: limit}
+                return await self.async_step_scan()
+        return self.async_show_form(
+            step_id="supply",
+            data_schema=self.add_suggested_values_to_schema(
+                supply_form(self.protocol), self.suggestions | (user_input or {})
+            ),
+            errors=errors,
+            description_placeholders=self.placeholders(),
+        )
 
     # -- Values to impose, where a search sets limits ----------------------------
 
@@ -245,8 +302,10 @@ class EvseBusConfigFlow(
         protocol = protocol_of(entry.data)
         errors: Errors = {}
         if user_input is not None:
-            errors = await self._async_check_port(protocol, user_input, entry)
+            errors = check_supply(user_input)
+            errors |= await self._async_check_port(protocol, user_input, entry)
             if not errors:
+                self.bus_data |= supply_data(user_input)
                 # Who gave the bus a name of their own keeps it.
                 own = entry.title != _title(entry.data)
                 title = entry.title if own else _title(self.bus_data)
@@ -258,10 +317,12 @@ class EvseBusConfigFlow(
                 )
                 return update(entry, title=title, data=self.bus_data)
         suggestions = port_suggestions(entry.data, line_settings(entry.data))
+        suggestions |= supply_data(entry.data)
         return self.async_show_form(
             step_id="reconfigure",
             data_schema=self.add_suggested_values_to_schema(
-                port_form(protocol.settings), user_input or suggestions
+                port_form(protocol.settings, supply_form(protocol)),
+                user_input or suggestions,
             ),
             errors=errors,
             description_placeholders=_port_placeholders(protocol),

@@ -37,6 +37,12 @@ class AddressForm:
     """Address that every box answers to, for a box that is alone on its line."""
     is_serial: bool = False
     """The address is the serial number."""
+    tells_serial: bool = True
+    """A box has a serial number that it tells, and that can be checked."""
+    alone: bool = False
+    """There is one box on such a bus, and no second one is added."""
+    labels: str | None = None
+    """Key of the texts for the addresses to choose from, under ``selector``."""
     digits: int = 1
 
     def parse(self, text: object) -> int:
@@ -73,11 +79,14 @@ class AddressForm:
         return SelectSelector(self._choice(multiple=True))
 
     def _choice(self, *, multiple: bool) -> SelectSelectorConfig:
-        return SelectSelectorConfig(
+        config = SelectSelectorConfig(
             options=[str(one) for one in range(self.lowest, self.highest + 1)],
             multiple=multiple,
             mode=SelectSelectorMode.DROPDOWN,
         )
+        if self.labels is not None:
+            config["translation_key"] = self.labels
+        return config
 
 
 ADDRESSES: Final[Mapping[str, AddressForm]] = {
@@ -97,6 +106,24 @@ ADDRESSES: Final[Mapping[str, AddressForm]] = {
         error="bad_device_id",
         lowest=1,
         highest=16,
+    ),
+    # The unit of a SmartEVSE is what its menu says of load balancing.
+    "smartevse": AddressForm(
+        one="unit",
+        many="units",
+        error="bad_unit",
+        lowest=0,
+        highest=8,
+        alone=True,
+    ),
+    "smartevse_master": AddressForm(
+        one="slave",
+        many="slaves",
+        error="bad_slave",
+        lowest=2,
+        highest=4,
+        tells_serial=False,
+        labels="slave",
     ),
 }
 

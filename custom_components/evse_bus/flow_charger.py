@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from homeassistant.const import CONF_ADDRESS, CONF_NAME
 from homeassistant.data_entry_flow import section
-from homeassistant.helpers.selector import TextSelector
+from homeassistant.helpers.selector import BooleanSelector, TextSelector
 import probatio as vol
 
 from .const import (
@@ -19,6 +19,7 @@ from .const import (
     CONF_PHASE_ORDER,
     CONF_POLL_INTERVAL,
     CONF_SERIAL,
+    CONF_STOP_ON_SHUTDOWN,
     CONF_VOLTAGE,
 )
 from .evse.model import MINIMUM_CURRENT
@@ -34,6 +35,7 @@ from .flow_schema import (
     default_of,
     dropdown,
     is_number,
+    model_name,
     quantity,
     suggest,
 )
@@ -50,6 +52,10 @@ LONGEST_POLL_INTERVAL: Final = 3600
 LONGEST_ORDER_LIFETIME: Final = 7 * 24 * 60
 INFORMATION_BYTES: Final = 16
 PHASE_ORDERS: Final = ("123", "132", "213", "231", "312", "321")
+
+YES: Final = "✓"
+NO: Final = "-"
+"""In tables, where a word would have to be translated."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,7 +78,7 @@ class Candidate:
         maximum = told.maximum_current if told else None
         return {
             "address": ADDRESSES[protocol.key].show(self.address),
-            "model": f"{told.info.manufacturer} {told.info.model}" if told else "?",
+            "model": model_name(told) if told else "?",
             "serial": self.serial(protocol) or "?",
             "maximum": f"{maximum:g} A" if maximum is not None else "?",
         }
@@ -85,7 +91,10 @@ def short_name(protocol: Protocol) -> str:
 
 def default_name(protocol: Protocol, address: int) -> str:
     """Return the name offered for a charger."""
-    return f"{short_name(protocol)} {ADDRESSES[protocol.key].show(address)}"
+    form = ADDRESSES[protocol.key]
+    if form.alone:
+        return short_name(protocol)
+    return f"{short_name(protocol)} {form.show(address)}"
 
 
 # -- The form --------------------------------------------------------------------
@@ -103,7 +112,7 @@ def charger_form(
     form: dict[vol.Marker, object] = {vol.Required(CONF_NAME): TextSelector()}
     if ask_address:
         form[vol.Required(address.one)] = address.selector
-        if not address.is_serial:
+        if address.tells_serial and not address.is_serial:
             form[vol.Optional(CONF_SERIAL)] = TextSelector()
     form[suggest(CONF_INSTALLATION_LIMIT, SUGGESTED_LIMIT)] = amperes(MINIMUM_CURRENT)
     if new:
@@ -112,10 +121,26 @@ def charger_form(
             form[
                 vol.Required(CONF_FAIL_SAFE_TIMEOUT, default=DEFAULT_FAIL_SAFE_TIMEOUT)
             ] = quantity(1, MAXIMUM_TIMEOUT, 1, "s")
+    if _lacks_fail_safe(protocol):
+        form |= _LIFETIME
+        form[vol.Required(CONF_STOP_ON_SHUTDOWN, default=False)] = BooleanSelector()
     form[vol.Required(CONF_EXPERT)] = section(
         _expert_form(protocol), {"collapsed": True}
     )
     return vol.Schema(form)
+
+
+_LIFETIME: Final[Mapping[vol.Marker, object]] = {
+    vol.Optional(CONF_ORDER_LIFETIME): quantity(1, LONGEST_ORDER_LIFETIME, 1, "min")
+}
+
+
+def _lacks_fail_safe(protocol: Protocol) -> bool:
+    """Return whether nothing in the box itself ever ends a charge.
+
+    Then what there is instead is not folded away.
+    """
+    return _has(protocol, CONF_STOP_ON_SHUTDOWN)
 
 
 def _expert_form(protocol: Protocol) -> vol.Schema:
@@ -126,10 +151,9 @@ def _expert_form(protocol: Protocol) -> vol.Schema:
         vol.Required(CONF_VOLTAGE, default=default_of(protocol, CONF_VOLTAGE)): (
             quantity(100, 300, 0.1, "V")
         ),
-        vol.Optional(CONF_ORDER_LIFETIME): quantity(
-            1, LONGEST_ORDER_LIFETIME, 1, "min"
-        ),
     }
+    if not _lacks_fail_safe(protocol):
+        form |= _LIFETIME
     if _has(protocol, CONF_COMMAND):
         form[
             vol.Required(CONF_COMMAND, default=str(default_of(protocol, CONF_COMMAND)))
@@ -162,6 +186,8 @@ def check_charger(
     expert = typed[CONF_EXPERT]
     if not typed[CONF_NAME].strip():
         errors[CONF_NAME] = "name_empty"
+    if not is_number(typed.get(CONF_ORDER_LIFETIME, 0)):
+        errors[CONF_ORDER_LIFETIME] = "not_a_number"
     numbers = (CONF_POLL_INTERVAL, CONF_VOLTAGE, CONF_ORDER_LIFETIME)
     if not all(is_number(expert[key]) for key in numbers if key in expert):
         errors["base"] = "expert_not_a_number"
@@ -197,10 +223,13 @@ def charger_data(
         CONF_INSTALLATION_LIMIT: typed[CONF_INSTALLATION_LIMIT],
         CONF_VOLTAGE: expert[CONF_VOLTAGE],
         CONF_POLL_INTERVAL: expert[CONF_POLL_INTERVAL],
-        CONF_ORDER_LIFETIME: expert.get(CONF_ORDER_LIFETIME),
+        CONF_ORDER_LIFETIME: expert.get(
+            CONF_ORDER_LIFETIME, typed.get(CONF_ORDER_LIFETIME)
+        ),
     }
-    if CONF_FAIL_SAFE_CURRENT in typed:
-        data[CONF_FAIL_SAFE_CURRENT] = typed[CONF_FAIL_SAFE_CURRENT]
+    for key in (CONF_FAIL_SAFE_CURRENT, CONF_STOP_ON_SHUTDOWN):
+        if key in typed:
+            data[key] = typed[key]
     if CONF_FAIL_SAFE_TIMEOUT in typed:
         data[CONF_FAIL_SAFE_TIMEOUT] = int(typed[CONF_FAIL_SAFE_TIMEOUT])
     if CONF_COMMAND in expert:
@@ -233,9 +262,10 @@ def charger_suggestions(protocol: Protocol, subentry: ConfigSubentry) -> dict[st
         CONF_INSTALLATION_LIMIT: stored[CONF_INSTALLATION_LIMIT],
         CONF_EXPERT: expert,
     }
-    if stored.get(CONF_SERIAL) is not None:
-        suggestions[CONF_SERIAL] = stored[CONF_SERIAL]
-    return suggestions
+    more = (CONF_SERIAL, CONF_ORDER_LIFETIME, CONF_STOP_ON_SHUTDOWN)
+    return suggestions | {
+        key: stored[key] for key in more if stored.get(key) is not None
+    }
 
 
 def confirm_row(protocol: Protocol, charger: ConfigSubentryData) -> str:
@@ -249,4 +279,8 @@ def confirm_row(protocol: Protocol, charger: ConfigSubentryData) -> str:
     ]
     if CONF_FAIL_SAFE_TIMEOUT in data:
         cells.append(f"{data[CONF_FAIL_SAFE_TIMEOUT]} s")
+    if CONF_STOP_ON_SHUTDOWN in data:
+        lifetime = data[CONF_ORDER_LIFETIME]
+        cells.append(NO if lifetime is None else f"{lifetime:g} min")
+        cells.append(YES if data[CONF_STOP_ON_SHUTDOWN] else NO)
     return f"| {' | '.join(cells)} |"

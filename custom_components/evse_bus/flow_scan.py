@@ -124,6 +124,8 @@ async def async_search(
         found=tuple(one for report in reports for one in report.found),
         duplicates=tuple(one for report in reports for one in report.duplicates),
         unreadable=any(report.unreadable for report in reports),
+        unsupported=tuple(one for report in reports for one in report.unsupported),
+        other_master=any(report.other_master for report in reports),
     )
 
 

@@ -35,7 +35,6 @@ from .const import (
 )
 from .evse.errors import RefusedOrderError
 from .evse.model import MAXIMUM_CURRENT, MINIMUM_CURRENT
-from .evse.protocols import PROTOCOLS
 from .evse.safety import INTERVALS_PER_TIMEOUT, MAXIMUM_TIMEOUT, number
 from .flow_address import ADDRESSES, Errors
 
@@ -53,6 +52,13 @@ CONF_SEARCH_CURRENT: Final = "search_current"
 SUGGESTED_LIMIT: Final = 16.0
 """Offered, never taken unseen: the user confirms what the wiring may carry, A."""
 DEFAULT_FAIL_SAFE_TIMEOUT: Final = 60
+
+MAKES: Final[Mapping[str, tuple[str, ...]]] = {
+    "evbox": ("evbox",),
+    "abl": ("abl",),
+    "smartevse": ("smartevse", "smartevse_master"),
+}
+"""What people choose first, and the protocols that it can then be."""
 
 COMMANDS: Final = ("68", "69")
 """EVBox messages; 69 has no serial number, so every box feels spoken to."""
@@ -148,12 +154,12 @@ def check_timeout(typed: Mapping[str, Any], poll_interval: float) -> Errors:
 
 
 def protocol_form() -> vol.Schema:
-    """Ask which language the chargers speak."""
+    """Ask which chargers they are."""
     return vol.Schema(
         {
             vol.Required(CONF_PROTOCOL): SelectSelector(
                 SelectSelectorConfig(
-                    options=list(PROTOCOLS),
+                    options=list(MAKES),
                     translation_key=CONF_PROTOCOL,
                     mode=SelectSelectorMode.LIST,
                 )
@@ -162,8 +168,11 @@ def protocol_form() -> vol.Schema:
     )
 
 
-def port_form(usual: LineSettings) -> vol.Schema:
-    """Ask for the port; experts may say how bytes look on the wire."""
+def port_form(usual: LineSettings, more: vol.Schema | None = None) -> vol.Schema:
+    """Ask for the port; experts may say how bytes look on the wire.
+
+    ``more`` is asked between the two.
+    """
     line = {
         vol.Required(CONF_BAUDRATE, default=usual.baudrate): quantity(
             300, 921_600, 1, "Bd"
@@ -178,6 +187,7 @@ def port_form(usual: LineSettings) -> vol.Schema:
     return vol.Schema(
         {
             vol.Required(CONF_DEVICE): SerialPortSelector(),
+            **(more.schema if more is not None else {}),
             vol.Required(CONF_LINE): section(vol.Schema(line), {"collapsed": True}),
         }
     )
@@ -291,8 +301,15 @@ def found_options(
     return [
         SelectOptionDict(
             value=str(one.address),
-            label=f"{show(one.address)}: {one.info.manufacturer} {one.info.model}"
+            label=f"{show(one.address)}: {model_name(one)}"
             + (f" ({one.serial})" if one.serial else ""),
         )
         for one in found
     ]
+
+
+def model_name(found: FoundCharger) -> str:
+    """Return what a charger found is."""
+    info = found.info
+    firmware = f", firmware {info.firmware}" if info.firmware else ""
+    return f"{info.manufacturer} {info.model}{firmware}"

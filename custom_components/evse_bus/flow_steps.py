@@ -29,7 +29,9 @@ from .flow_schema import (
     check_currents,
     found_form,
     found_options,
+    model_name,
 )
+from .flow_supply import supply_texts
 from .setup import charger_unique_id, line_settings
 
 if TYPE_CHECKING:
@@ -44,7 +46,7 @@ class ChargerSteps[
 ](FlowHandler[ContextT, ResultT, HandlerT]):
     """From a bus to chargers that are ready to be stored."""
 
-    several: ClassVar[bool]
+    at_once: ClassVar[bool]
     """More than one charger can be added at once."""
     step_after_error: ClassVar[str]
     """Where one goes when it could not be made; shows `take_error`."""
@@ -85,6 +87,11 @@ class ChargerSteps[
         """Return their addresses."""
         return {one.data[CONF_ADDRESS] for one in self.others()}
 
+    @property
+    def several(self) -> bool:
+        """Return whether more than one charger can be added now."""
+        return self.at_once and not ADDRESSES[self.protocol.key].alone
+
     # -- Search ------------------------------------------------------------------
 
     async def async_step_scan(
@@ -116,8 +123,12 @@ class ChargerSteps[
         return self.async_show_progress_done(next_step_id=self._step_after_scan())
 
     def _step_after_scan(self) -> str:
+        if self._report.other_master:
+            return "other_master"
         if self._report.duplicates:
             return "duplicates"
+        if self._report.unsupported:
+            return "unsupported"
         if self._new():
             return "select"
         if self._report.found:
@@ -163,6 +174,26 @@ class ChargerSteps[
         addresses = ", ".join(show(one) for one in self._report.duplicates)
         first = ("select",) if self._new() else ()
         return self._menu("duplicates", first, addresses=addresses)
+
+    async def async_step_unsupported(
+        self,
+        user_input: dict[str, Any] | None = None,  # noqa: ARG002
+    ) -> ResultT:
+        """Say that chargers answered whose firmware cannot be used like this."""
+        show = ADDRESSES[self.protocol.key].show
+        chargers = "\n".join(
+            f"- {show(one.address)}: {model_name(one)}"
+            for one in self._report.unsupported
+        )
+        first = ("select",) if self._new() else ()
+        return self._menu("unsupported", first, chargers=chargers)
+
+    async def async_step_other_master(
+        self,
+        user_input: dict[str, Any] | None = None,  # noqa: ARG002
+    ) -> ResultT:
+        """Say that there is a master already, so that we must be silent."""
+        return self._menu("other_master")
 
     def _menu(
         self, step_id: str, first: tuple[str, ...] = (), **placeholders: str
@@ -316,7 +347,8 @@ class ChargerSteps[
         rows = (confirm_row(self.protocol, one) for one in self._ready)
         return self.async_show_form(
             step_id=f"confirm_{self.protocol.key}",
-            description_placeholders={"chargers": "\n".join(rows)},
+            description_placeholders=supply_texts(self.bus_data)
+            | {"chargers": "\n".join(rows)},
             last_step=True,
         )
 
@@ -330,4 +362,16 @@ class ChargerSteps[
         self, user_input: dict[str, Any] | None = None
     ) -> ResultT:
         """Store, now that the user knows that an ABL box has none."""
+        return self._confirm(user_input)
+
+    async def async_step_confirm_smartevse(
+        self, user_input: dict[str, Any] | None = None
+    ) -> ResultT:
+        """Store, now that the user knows that a polled SmartEVSE has none."""
+        return self._confirm(user_input)
+
+    async def async_step_confirm_smartevse_master(
+        self, user_input: dict[str, Any] | None = None
+    ) -> ResultT:
+        """Store, now that the user knows that slaves stop without us."""
         return self._confirm(user_input)

@@ -44,7 +44,7 @@ class ChargerSubentryFlow(
 ):
     """Add or change one charger."""
 
-    several = False
+    at_once = False
     step_after_error = "manual"
 
     @override
@@ -65,6 +65,8 @@ class ChargerSubentryFlow(
         entry = self._get_entry()
         self.protocol = protocol_of(entry.data)
         self.bus_data = dict(entry.data)
+        if ADDRESSES[self.protocol.key].alone and self.others():
+            return self.async_abort(reason="one_box")
         # A search that sets limits is left to the charger's own first turn; and
         # the address that every box answers to is not for a bus with others on it.
         searchable = not self.protocol.probe_imposes

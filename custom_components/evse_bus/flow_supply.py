@@ -1,0 +1,66 @@
+"""What the chargers of a bus share, where Home Assistant is their master. Pure."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+import probatio as vol
+
+from .const import CONF_SUPPLY_LIMIT, CONF_SUPPLY_MINIMUM
+from .evse.model import MAXIMUM_CURRENT, MINIMUM_CURRENT
+from .flow_schema import is_number, quantity, suggest
+
+if TYPE_CHECKING:
+    from .evse.protocol import Protocol
+    from .flow_address import Errors
+
+SUGGESTED_SUPPLY: Final = 16.0
+"""The smallest usual circuit for chargers; taken only once it was confirmed, A."""
+HIGHEST_SUPPLY: Final = 3 * MAXIMUM_CURRENT
+"""More than this three boxes cannot take, A."""
+HIGHEST_MINIMUM: Final = 16.0
+"""As in the menu of a SmartEVSE (MIN), A."""
+
+
+def supply_form(protocol: Protocol) -> vol.Schema:
+    """Ask what all chargers share; nothing, where each is on its own."""
+    if protocol.duty is None:
+        return vol.Schema({})
+    return vol.Schema(
+        {
+            suggest(CONF_SUPPLY_LIMIT, SUGGESTED_SUPPLY): quantity(
+                MINIMUM_CURRENT, HIGHEST_SUPPLY, 0.1, "A"
+            ),
+            vol.Required(CONF_SUPPLY_MINIMUM, default=MINIMUM_CURRENT): quantity(
+                MINIMUM_CURRENT, HIGHEST_MINIMUM, 0.1, "A"
+            ),
+        }
+    )
+
+
+def check_supply(typed: Mapping[str, Any]) -> Errors:
+    """Return what is wrong with the shared supply of a form, if it asks for it."""
+    keys = (CONF_SUPPLY_LIMIT, CONF_SUPPLY_MINIMUM)
+    errors = {
+        key: "not_a_number"
+        for key in keys
+        if key in typed and not is_number(typed[key])
+    }
+    if errors or CONF_SUPPLY_LIMIT not in typed:
+        return errors
+    if typed[CONF_SUPPLY_MINIMUM] > typed[CONF_SUPPLY_LIMIT]:
+        return {CONF_SUPPLY_MINIMUM: "above_supply"}
+    return {}
+
+
+def supply_data(values: Mapping[str, Any]) -> dict[str, float]:
+    """Return the shared supply, of a checked form or of an entry's data."""
+    return {
+        key: float(values[key])
+        for key in (CONF_SUPPLY_LIMIT, CONF_SUPPLY_MINIMUM)
+        if key in values
+    }
+
+
+def supply_texts(data: Mapping[str, Any]) -> dict[str, str]:
+    """Return the shared supply for the texts."""
+    return {key: f"{value:g}" for key, value in supply_data(data).items()}
