@@ -16,6 +16,10 @@ CONF_BAUDRATE: Final = "baudrate"
 """Only where an expert has overridden the protocol's own; so with the next two."""
 CONF_PARITY: Final = "parity"
 CONF_STOP_BITS: Final = "stop_bits"
+CONF_SUPPLY_LIMIT: Final = "supply_limit"
+"""What all chargers of a bus may draw together, A a phase (where we are its master)."""
+CONF_SUPPLY_MINIMUM: Final = "supply_minimum"
+"""Least current that a charger of such a bus charges with, A."""
 
 # -- A config subentry is one charger --------------------------------------------
 # Its address stands under homeassistant.const.CONF_ADDRESS.
@@ -42,3 +46,5 @@ CONF_INFORMATION: Final = "information"
 """The information module as 32 hex digits (EVBox)."""
 CONF_PHASE_ORDER: Final = "phase_order"
 """Which phase the first, second and third current belong to (ABL)."""
+CONF_STOP_ON_SHUTDOWN: Final = "stop_on_shutdown"
+"""Charging is stopped when Home Assistant stops (SmartEVSE, polled)."""
