@@ -94,6 +94,8 @@ class Control:
             device.press_access()
         elif word == "menu":
             device.set_at_the_box(values[0], int(values[1]))
+        elif word == "others":
+            device.set_by_somebody(float(values[0]))
         elif word == "temperature":
             device.outlet.temperature = int(values[0])
         else:

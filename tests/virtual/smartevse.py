@@ -104,6 +104,15 @@ class SmartEvse(Device):
         return self.outlet.state
 
     @property
+    def serial(self) -> int:
+        """Return the serial number; only the later dialect tells it."""
+        return self.controller.serial
+
+    @serial.setter
+    def serial(self, serial: int) -> None:
+        self.controller.serial = serial
+
+    @property
     def access(self) -> bool:
         """Tell whether it may charge."""
         return self.outlet.access
@@ -183,6 +192,11 @@ class SmartEvse(Device):
     def power_cycle(self) -> None:
         """Lose power for a moment: access is open again, the override is gone."""
         self.controller.power_cycle()
+
+    @on_bus_thread
+    def set_by_somebody(self, amps: float) -> None:
+        """Let somebody else override the charging current; 0 ends that."""
+        self.outlet.override = round(amps * 10)
 
     @on_bus_thread
     def set_at_the_box(self, name: str, value: int) -> None:

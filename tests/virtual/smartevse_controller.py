@@ -42,6 +42,7 @@ VOLATILE_MODE_2_17 = 0xA8
 class SmartEvseController:
     """The controller of one box, with its outlet.
 
+    `override_works`, `ignore_access`: defects, or what an earlier firmware lacks.
     `receive` a frame at a time; `step`, and send what is then in `sending`.
     """
 
@@ -62,6 +63,7 @@ class SmartEvseController:
         self.unit_when_disabled = dialect.unit_when_disabled if unit is None else unit
         self.serial = serial
         self.override_works = override_works
+        self.ignore_access = False
         self.now = 0.0
         self.sending: list[bytes] = []
         self.writes: list[RegisterWrite] = []
@@ -273,7 +275,7 @@ class SmartEvseController:
                 out.override = value
         elif item == "access":
             taken = value in (0, 1) or self.dialect.status_writable
-            if value in (0, 1):
+            if value in (0, 1) and not self.ignore_access:
                 out.set_access(bool(value))
         elif item == "mode_now":
             taken = self._set_mode(value)

@@ -9,6 +9,7 @@ from pathlib import Path
 import signal
 import subprocess
 import sys
+import termios
 import time
 
 import pytest
@@ -78,3 +79,38 @@ def test_evbox() -> None:
     with running("evbox", *arguments) as (_, url), RawClient(url) as client:
         request = b"\x0280A06900E6008C0154003C002800500046F703\x03"
         assert client.ask(request, b"\x03")[15:17] == b"03"
+
+
+def test_smartevse(tmp_path: Path) -> None:
+    """A slave that asks, and what somebody does at the box."""
+    stats = tmp_path / "stats.json"
+    arguments = ["--load-balance", "0", "2", "--max-current", "20", "--cables", "32"]
+    arguments += ["--control", "--stats", str(stats), "--time-scale", "4"]
+    with running("smartevse", *arguments) as (process, url):
+        assert process.stdin
+        assert process.stdout
+        with RawClient(url, "N", termios.B9600) as client:
+            client.write(bytes.fromhex("000400a0000931ff"))
+            assert client.read(23)[:5].hex() == "0004120041"
+            for text in ("plug 2", "menu 2 min_current 8", "press 0", "fail 2 1"):
+                process.stdin.write(text + "\n")
+                process.stdin.flush()
+            answers = [process.stdout.readline() for _ in range(4)]
+            assert answers[:3] == ["ok\n"] * 3
+            assert answers[3].startswith("error fail 2 1: no such command")
+            assert client.read(6).hex() == "0206000200c8"
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(5) == 0
+    counters = json.loads(stats.read_text())["devices"]
+    assert counters["smartevse-0"]["requests"] == 1
+    assert counters["smartevse-2"]["unasked"] >= 1
+
+
+def test_smartevse_dialects() -> None:
+    arguments = ["--dialect", "later", "--serial", "77"]
+    with (
+        running("smartevse", *arguments) as (_, url),
+        RawClient(url, "N", termios.B9600) as client,
+    ):
+        client.write(bytes.fromhex("0103000b0001f5c8"))
+        assert client.read(7)[:5].hex() == "010302004d"

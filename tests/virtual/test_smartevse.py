@@ -355,6 +355,21 @@ def test_answers_wait_for_silence() -> None:
         assert bus.wire.collisions == 0
 
 
+def test_defects() -> None:
+    alone = charging()
+    alone.box.ignore_access = True
+    assert alone.write(0xA7, 0) == "ok"
+    assert alone.read(0xA7) == [1]
+    assert alone.outlet.contactor
+    box = SmartEvse()
+    box.set_by_somebody(10)
+    assert box.outlet.override == 100
+    box.set_at_the_box("max_current", 16)
+    assert box.outlet.settings["max_current"] == 16
+    with pytest.raises(ValueError, match="6 to 80"):
+        box.set_at_the_box("max_current", 5)
+
+
 def test_witness() -> None:
     box = SmartEvse(load_balance=2)
     with line_to(box) as (bus, client):
