@@ -1,0 +1,171 @@
+"""What a polled SmartEVSE and a load-balancing slave share: access, settings, turns.
+
+Every turn has one exchange at most, so that a master's broadcast never waits for
+more. PROTOCOLS.md, 3.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Final, override
+
+from ..errors import GarbledReplyError, NotConfirmedError
+from ..exchange import Request, Talk
+from ..jobs import Later
+from ..model import ChargerConfig, Fault, Orders, Range, Setting
+from ..turns import Turns, in_turns
+from .dialects import MAPS
+from .exchanges import write
+from .reader import SmartEvseReader
+from .registers import write_access
+from .setup import SetUp
+from .states import is_stopped
+from .timing import LOOK_AGAIN
+
+WRITES: Final = 2
+"""How often something is written until it must be read back."""
+GARBLED: Final = 3
+"""Unreadable answers in a row that look like two boxes with one address."""
+
+
+class SmartEvseBox(SmartEvseReader):
+    """One SmartEVSE."""
+
+    def __init__(self, config: ChargerConfig, orders: Orders) -> None:
+        """Take the set-up; the box is not known before it answers."""
+        super().__init__(config, orders)
+        self._garbled = 0
+        self._conversations: set[object] = set()
+        self._set_up = SetUp(self)
+
+    @override
+    def on_line_open(self) -> None:
+        super().on_line_open()
+        # A conversation that was cut short with the line does not come to its end.
+        self._conversations.clear()
+
+    # -- The regular exchange ------------------------------------------------------
+
+    @override
+    async def poll(self, talk: Talk) -> Later[None] | None:
+        try:
+            if self.dialect is None:
+                return await in_turns(self._meet)(talk)
+            await self.look(talk)
+        except GarbledReplyError:
+            self._garbled += 1
+            if self._garbled >= GARBLED:
+                self.tell(Fault.DUPLICATE_ADDRESS, present=True)
+            raise
+        self._garbled = 0
+        self.tell(Fault.DUPLICATE_ADDRESS, present=False)
+        return self.what_now(talk.now)
+
+    async def _meet(self, talk: Talk) -> Turns:
+        """Learn all about a box that was just found."""
+        async for pause in self.reach(talk):
+            yield pause
+        yield 0.0
+        if not self.busy and self.must_tend(talk.now):
+            async for pause in self._tend(talk):
+                yield pause
+
+    def what_now(self, now: float) -> Later[None] | None:
+        """Return what must be asked or said because of a status."""
+        if self.busy or not self.must_tend(now):
+            return None
+        return Later(0.0, in_turns(self._tend))
+
+    async def _tend(self, talk: Talk) -> Turns:
+        token = self.begin()
+        try:
+            async for pause in self.tend(talk):
+                yield pause
+        finally:
+            self.end(token)
+
+    def must_tend(self, now: float) -> bool:
+        """Return whether something is to be asked or said beside the status."""
+        return now >= self.configuration_due
+
+    async def tend(self, talk: Talk) -> Turns:
+        """Ask and say what is due; what is not answered is for another time."""
+        if talk.now >= self.configuration_due:
+            async for pause in self.read_configuration(talk):
+                yield pause
+
+    # -- What it keeps in its memory -------------------------------------------------
+
+    @property
+    @override
+    def settings(self) -> Mapping[Setting, Range]:
+        if self.dialect is None or self.configuration is None:
+            return {}
+        ranges = {
+            setting: kept.range for setting, kept in MAPS[self.dialect].settings.items()
+        }
+        # No setting may promise the box more than its wiring carries.
+        own = ranges[Setting.MAXIMUM_CURRENT]
+        highest = min(own.maximum, int(self.config.installation_limit))
+        ranges[Setting.MAXIMUM_CURRENT] = replace(own, maximum=highest)
+        return ranges
+
+    @override
+    async def configure(self, setting: Setting, value: int) -> None:
+        conversation = self._set_up.conversation(setting, value)
+        await self.run(in_turns(conversation))
+
+    # -- Access ----------------------------------------------------------------------
+
+    async def set_access(self, talk: Talk, allowed: bool) -> Turns:  # noqa: FBT001
+        """Set the access bit until the box is read back to have obeyed.
+
+        Off counts when no car can charge any more (`states.is_stopped`). Raises
+        NotConfirmedError when the box does not follow.
+        """
+        async for pause in self.reach(talk):
+            yield pause
+        dialect = self.known_dialect
+        for _ in range(WRITES):
+            await self.write(
+                talk,
+                partial(write_access, self.config.address, dialect, allowed),
+                MAPS[dialect].access_register,
+            )
+            for pause in (0.0, LOOK_AGAIN):
+                yield pause
+                async for wait in self.see(talk):
+                    yield wait
+                if self._has_access(allowed):
+                    return
+        what = "on" if allowed else "off"
+        message = f"{self.config.name} does not turn its access {what}"
+        raise NotConfirmedError(message)
+
+    def _has_access(self, allowed: bool) -> bool:  # noqa: FBT001
+        if self.status is None:
+            return False
+        if allowed:
+            return self.status.access
+        return is_stopped(self.known_dialect, self.status)
+
+    async def write(self, talk: Talk, request: Request, register: int) -> bool | None:
+        """Write a register (see `exchanges.write`)."""
+        return await write(talk, self.config.address, request, register)
+
+    # -- Conversations -----------------------------------------------------------------
+
+    @property
+    def busy(self) -> bool:
+        """Return whether a conversation is under way: then polls only read."""
+        return bool(self._conversations)
+
+    def begin(self) -> object:
+        """Note that a conversation began."""
+        token = object()
+        self._conversations.add(token)
+        return token
+
+    def end(self, token: object) -> None:
+        """Note that a conversation is over."""
+        self._conversations.discard(token)

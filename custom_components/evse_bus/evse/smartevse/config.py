@@ -1,0 +1,56 @@
+"""What the user sets up for a SmartEVSE."""
+
+from dataclasses import dataclass
+
+from ..model import ChargerConfig
+from .dialects import Dialect
+from .registers import UNITS
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SmartEvseConfig(ChargerConfig):
+    """A SmartEVSE; its address is its load-balancing setting, mostly.
+
+    Raises ValueError for an address that cannot be.
+    """
+
+    poll_interval: float = 2.0
+    """s; a later one that is polled is left alone for longer, see `timing.QUIET`."""
+    dialect: Dialect | None = None
+    """``None``: found by probing, on each connect."""
+
+    def __post_init__(self) -> None:
+        """Check the address."""
+        if self.address not in UNITS:
+            message = f"{self.address} is no address of a SmartEVSE (0 to 8)"
+            raise ValueError(message)
+
+
+def smartevse_config(config: ChargerConfig) -> SmartEvseConfig:
+    """Return the set-up as this protocol's own; TypeError for another one's."""
+    if not isinstance(config, SmartEvseConfig):
+        message = f"{config.name} is not set up as a SmartEVSE"
+        raise TypeError(message)
+    return config
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PolledConfig(SmartEvseConfig):
+    """A SmartEVSE without load balancing, or one that is its own master."""
+
+    stop_on_shutdown: bool = False
+    """Turn its access off when everything stops: it has no fail-safe of its own."""
+
+    def __post_init__(self) -> None:
+        """Check the address: slaves stop when no master broadcasts."""
+        if self.address not in (0, 1):
+            message = f"{self.address} is the address of a slave; polled are 0 and 1"
+            raise ValueError(message)
+
+
+def polled_config(config: ChargerConfig) -> PolledConfig:
+    """Return the set-up as this protocol's own; TypeError for another one's."""
+    if not isinstance(config, PolledConfig):
+        message = f"{config.name} is not set up as a polled SmartEVSE"
+        raise TypeError(message)
+    return config

@@ -1,0 +1,281 @@
+"""What is known of one SmartEVSE, and how it is asked: polled or as a slave.
+
+Nothing is written before the box was read since the last (re)connect: the dialect was
+found, and where it tells a serial number, that is the right one. PROTOCOLS.md, 3.
+"""
+
+from math import inf
+from typing import ClassVar, Final, override
+
+from ..charger import Charger
+from ..errors import (
+    ExchangeRefusedError,
+    ImplausibleReplyError,
+    NotAvailableError,
+    ReplyTimeoutError,
+    WrongChargerError,
+)
+from ..exchange import Talk
+from ..model import (
+    MINIMUM_CURRENT,
+    Capability,
+    ChargerConfig,
+    Fault,
+    Limits,
+    Orders,
+    Setting,
+)
+from ..turns import Turns
+from .config import smartevse_config
+from .dialects import MAPS, Block, Dialect
+from .exchanges import read
+from .probing import Probe
+from .readings import capabilities_of, charger_info, charger_reading
+from .registers import (
+    ILLEGAL_ADDRESS,
+    LONGEST_REQUEST,
+    Configuration,
+    Status,
+    decode_configuration,
+    decode_status,
+)
+from .states import UNPLUGGED, tells_plug
+from .timing import (
+    CONFIGURATION_INTERVAL,
+    ERROR_DOUBT,
+    LOOK_AGAIN,
+    PLUG_DOUBT,
+    TIMING,
+)
+
+LOOKS: Final = 3
+"""How often a box is looked at that does not answer in the midst of something."""
+NOT_UNDERSTOOD: Final = 3
+"""Answers in a row that cannot be, until nothing said before counts any more."""
+CONFIGURATION_RETRY: Final = 30.0
+"""Pause after settings that could not be read, s."""
+
+
+class SmartEvseReader(Charger):
+    """One SmartEVSE, as far as it is asked and not told."""
+
+    timing: ClassVar = TIMING
+
+    def __init__(self, config: ChargerConfig, orders: Orders) -> None:
+        """Take the set-up; the box is not known before it answers."""
+        super().__init__(config, orders)
+        self.dialect: Dialect | None = None
+        """What it speaks; ``None``: not known since the last connect."""
+        self.status: Status | None = None
+        """What it told last; ``None``: nothing since the last connect."""
+        self.configuration: Configuration | None = None
+        self.configuration_due = 0.0
+        """Loop time at which its settings are to be read again."""
+        self._serial: str | None = None
+        self._plug_doubted_until = 0.0
+        self._not_understood = 0
+
+    # -- What it is and has --------------------------------------------------------
+
+    @property
+    @override
+    def capabilities(self) -> frozenset[Capability]:
+        known = capabilities_of(self.dialect)
+        if self.config.order_lifetime is not None:
+            # The box has no such value; it counts when orders are not renewed.
+            known |= {Capability.FAIL_SAFE_CURRENT}
+        return known
+
+    @property
+    @override
+    def limits(self) -> Limits:
+        installation = self.config.installation_limit
+        if self.configuration is None:
+            return Limits(installation=installation, reports_maximum=True)
+        settings = self.configuration.settings
+        cable = self.status.maximum if self.status is not None else None
+        return Limits(
+            installation=installation,
+            reports_maximum=True,
+            reported=min(settings[Setting.MAXIMUM_CURRENT], cable or inf),
+            minimum=max(settings[Setting.MINIMUM_CURRENT], MINIMUM_CURRENT),
+        )
+
+    @property
+    @override
+    def longest_request(self) -> int:
+        return LONGEST_REQUEST
+
+    @override
+    def on_line_open(self) -> None:
+        self.forget()
+
+    def forget(self) -> None:
+        """Learn anew what it is before anything is written."""
+        self.dialect = None
+        self.status = None
+        self.configuration = None
+        self.configuration_due = 0.0
+        self._plug_doubted_until = 0.0
+
+    @override
+    def missed(self, now: float) -> None:
+        super().missed(now)
+        # Whoever answers next may be another one: read before anything is written.
+        self.status = None
+
+    # -- Who it is -----------------------------------------------------------------
+
+    async def reach(self, talk: Talk) -> Turns:
+        """Make sure that we know whom we talk to, and what state it is in.
+
+        Raises ImplausibleReplyError for a box of no known dialect, WrongChargerError
+        for another box, and what `read` raises.
+        """
+        if self.dialect is None:
+            async for pause in self._find_dialect(talk):
+                yield pause
+            yield 0.0
+        if self.status is None:
+            async for pause in self.see(talk):
+                yield pause
+
+    async def _find_dialect(self, talk: Talk) -> Turns:
+        found = smartevse_config(self.config).dialect
+        probe = Probe()
+        while found is None:
+            try:
+                await self._ask(talk, probe)
+            except ImplausibleReplyError:
+                self.tell(Fault.UNSUPPORTED_FIRMWARE, present=True)
+                raise
+            found = probe.found
+            if found is None:
+                yield 0.0
+        self.tell(Fault.UNSUPPORTED_FIRMWARE, present=False)
+        self.dialect = found
+        self.info = charger_info(found, self._serial)
+
+    async def _ask(self, talk: Talk, probe: Probe) -> None:
+        try:
+            data = await self.read(talk, probe.ask)
+        except ExchangeRefusedError as error:
+            probe.refused(error.code)
+        else:
+            probe.told(data)
+
+    # -- What it says --------------------------------------------------------------
+
+    @property
+    def known_dialect(self) -> Dialect:
+        """Return the dialect; raises NotAvailableError before it is known."""
+        if self.dialect is None:
+            message = f"{self.config.name} has not answered yet"
+            raise NotAvailableError(message)
+        return self.dialect
+
+    async def read(self, talk: Talk, block: Block) -> bytes:
+        """Return the bytes of a block (see `exchanges.read`)."""
+        return await read(talk, self.config.address, block)
+
+    async def see(self, talk: Talk) -> Turns:
+        """Look at the box; a lost answer is asked for again."""
+        for last in (False,) * (LOOKS - 1) + (True,):
+            try:
+                await self.look(talk)
+            except ReplyTimeoutError:
+                if last:
+                    raise
+            else:
+                return
+            yield LOOK_AGAIN
+
+    async def look(self, talk: Talk) -> Status:
+        """Read the status, and keep it: one exchange.
+
+        Raises ImplausibleReplyError for what cannot be (it changes nothing),
+        WrongChargerError, and what `read` raises.
+        """
+        dialect = self.known_dialect
+        try:
+            status = decode_status(dialect, await self.read(talk, MAPS[dialect].status))
+        except ExchangeRefusedError as error:
+            if error.code == ILLEGAL_ADDRESS:
+                # Its firmware is another one than a moment ago.
+                self._lose_faith()
+            raise
+        except ImplausibleReplyError:
+            self._not_understood += 1
+            if self._not_understood >= NOT_UNDERSTOOD:
+                self._lose_faith()
+            raise
+        self._not_understood = 0
+        self.tell(Fault.IMPLAUSIBLE, present=False)
+        self._check_identity(status)
+        self.take(status, talk.now)
+        return status
+
+    def _lose_faith(self) -> None:
+        """Let nothing said before count: this box does not speak as it did."""
+        self._not_understood = 0
+        self.tell(Fault.IMPLAUSIBLE, present=True)
+        self.set_unavailable()
+
+    def _check_identity(self, status: Status) -> None:
+        """Make sure that the right box answers, where it tells who it is."""
+        if self.dialect is not Dialect.LATER:
+            return
+        expected = self.config.serial or self._serial
+        if expected is not None and status.serial != expected:
+            self.tell(Fault.WRONG_CHARGER, present=True)
+            self.set_unavailable()
+            found = status.serial or "no serial number"
+            message = f"{self.config.name}: {found} answers, not {expected}"
+            raise WrongChargerError(message, expected=expected, found=found)
+        self.tell(Fault.WRONG_CHARGER, present=False)
+        self._serial = status.serial
+        self.info = charger_info(self.dialect, status.serial)
+
+    def take(self, status: Status, now: float) -> None:
+        """Make a reading of a status."""
+        dialect = self.known_dialect
+        if not tells_plug(dialect, status):
+            doubt = ERROR_DOUBT if status.faults else PLUG_DOUBT
+            self._plug_doubted_until = max(self._plug_doubted_until, now + doubt)
+        elif status.raw_state != UNPLUGGED:
+            self._plug_doubted_until = 0.0
+        self.status = status
+        reading = charger_reading(
+            dialect,
+            status,
+            self.configuration,
+            plug_told=now >= self._plug_doubted_until,
+        )
+        if reading != self.reading:
+            self.reading = reading
+            self.updated()
+
+    # -- What it keeps in its memory -------------------------------------------------
+
+    async def read_configuration(self, talk: Talk) -> Turns:
+        """Read the settings; what is not told or cannot be changes nothing."""
+        dialect = self.known_dialect
+        told: dict[Block, bytes] = {}
+        try:
+            for block in MAPS[dialect].configuration:
+                told[block] = await self.read(talk, block)
+                yield 0.0
+            configuration = decode_configuration(dialect, told)
+        except ImplausibleReplyError, ReplyTimeoutError, ExchangeRefusedError:
+            self.configuration_due = talk.now + CONFIGURATION_RETRY
+            return
+        self.configuration = configuration
+        self.configuration_due = talk.now + CONFIGURATION_INTERVAL
+        if self.status is not None:
+            self.take(self.status, talk.now)
+
+    def tell(self, fault: Fault, *, present: bool) -> None:
+        """Note a fault of our own finding, and tell the listeners of a change."""
+        if present != (fault in self.noticed):
+            self.notice(fault, present=present)
+            self.updated()

@@ -1,0 +1,99 @@
+"""From what a SmartEVSE says to the words that everybody shares. Pure."""
+
+from typing import Final
+
+from ..model import (
+    Capability,
+    ChargerInfo,
+    ChargerReading,
+    ConnectorReading,
+    Setting,
+)
+from .dialects import MAPS, Dialect
+from .registers import Configuration, Status
+from .states import UNPLUGGED, offered, state_of, tells_plug, word_of
+
+_CAPABILITIES: Final = frozenset(
+    {
+        Capability.STATUS,
+        Capability.RAW_STATE,
+        Capability.PLUGGED,
+        Capability.CHARGING,
+        Capability.OFFERED_CURRENT,
+        Capability.MAXIMUM_CURRENT,
+        Capability.MINIMUM_CURRENT,
+        Capability.FAULTS,
+        Capability.MODE,
+    }
+)
+_FIRMWARE: Final = {
+    Dialect.V2_17: "2.17",
+    Dialect.V2_20: "2.20",
+    Dialect.LATER: "later than 2.20",
+}
+
+
+def capabilities_of(dialect: Dialect | None) -> frozenset[Capability]:
+    """Return what a box of a dialect has; ``None``: not known yet."""
+    if dialect is not None and MAPS[dialect].temperature is not None:
+        return _CAPABILITIES | {Capability.TEMPERATURE}
+    return _CAPABILITIES
+
+
+def charger_info(dialect: Dialect, serial: str | None) -> ChargerInfo:
+    """Return what a box is; the version is what its registers look like."""
+    return ChargerInfo(
+        manufacturer="Stegen Electronics",
+        model="SmartEVSE v2",
+        serial=serial,
+        firmware=_FIRMWARE[dialect],
+    )
+
+
+def charger_reading(
+    dialect: Dialect,
+    status: Status,
+    configuration: Configuration | None,
+    *,
+    plug_told: bool,
+) -> ChargerReading:
+    """Return what a status tells.
+
+    ``plug_told``: no access and no error has just hidden a plugged car; without it
+    ``A`` is not taken for "unplugged".
+    """
+    state = state_of(dialect, status.raw_state)
+    hidden = status.raw_state == UNPLUGGED and not (
+        plug_told and tells_plug(dialect, status)
+    )
+    settings = configuration.settings if configuration is not None else {}
+    maxima = (status.maximum, settings.get(Setting.MAXIMUM_CURRENT))
+    minimum = status.minimum or settings.get(Setting.MINIMUM_CURRENT)
+    connector = ConnectorReading(
+        status=word_of(dialect, status),
+        raw_state=status.raw_state,
+        plugged=None if hidden else state.plugged,
+        charging=state.charging,
+        minimum_current=None if minimum is None else float(minimum),
+    )
+    return ChargerReading(
+        connectors={1: connector},
+        allowed=status.access,
+        offered_current=offered(dialect, status),
+        maximum_current=min(
+            (float(one) for one in maxima if one is not None), default=None
+        ),
+        mode=status.mode,
+        temperature=(None if status.temperature is None else float(status.temperature)),
+        settings=settings,
+        faults=status.faults,
+        fault_codes=(f"0x{status.error:02X}",) if status.error else (),
+        details={
+            "dialect": dialect.value,
+            "load_balancing": (
+                configuration.load_balancing if configuration is not None else None
+            ),
+            "current_in_force": status.current,
+            "cable_current": status.maximum,
+        },
+    )
