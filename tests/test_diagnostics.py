@@ -14,8 +14,8 @@ from custom_components.evse_bus.const import DOMAIN
 from custom_components.evse_bus.diagnostics import (
     async_get_config_entry_diagnostics,
     async_get_device_diagnostics,
-    without_serial,
 )
+from custom_components.evse_bus.redaction import without_serial
 from tests.common import call, get_entity, running, wait_for_state
 from tests.virtual import AblBox, EvboxChargePoint
 

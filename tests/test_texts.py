@@ -9,16 +9,18 @@ import pytest
 from custom_components.evse_bus import (
     binary_sensor,
     button,
-    number,
+    number_tables,
+    select as selects,
     sensor_tables,
     switch as switches,
 )
 from custom_components.evse_bus.errors import _COMMAND_KEYS, _PORT_KEYS
-from custom_components.evse_bus.evse.model import Fault, Status
 from custom_components.evse_bus.issues import (
     _FAULT_KEYS,
     LOST,
     NOT_STORED,
+    SECOND_MASTER,
+    SUPPLY_LOST,
     TIMEOUT_RAISED,
 )
 from tests.flow import english
@@ -31,9 +33,15 @@ DESCRIPTIONS = {
         binary_sensor.CONNECTED,
         binary_sensor.ORDERS_EXPIRED,
         binary_sensor.PROBLEM,
+        binary_sensor.SECOND_MASTER,
     ],
     "button": button.BUTTONS,
-    "number": number.NUMBERS,
+    "number": [
+        *number_tables.NUMBERS,
+        *number_tables.SETTINGS,
+        number_tables.SUPPLY,
+    ],
+    "select": [selects.MODE, selects.MODE_AT_START],
     "sensor": [
         *sensor_tables.BUS_SENSORS,
         *sensor_tables.CHARGER_SENSORS,
@@ -58,14 +66,11 @@ def test_entities_have_names(platform: str) -> None:
             continue
         used.add(description.translation_key)
         placeholders = description.translation_placeholders or {}
-        assert texts[description.translation_key]["name"].format(**placeholders)
+        text = texts[description.translation_key]
+        assert text["name"].format(**placeholders)
+        if (options := getattr(description, "options", None)) is not None:
+            assert text["state"].keys() == set(options)
     assert used == texts.keys()
-
-
-def test_states_have_names() -> None:
-    texts = english()["entity"]["sensor"]
-    assert texts["status"]["state"].keys() == {str(status) for status in Status}
-    assert texts["fault"]["state"].keys() == {"none", *(str(fault) for fault in Fault)}
 
 
 @pytest.mark.parametrize("platform", DESCRIPTIONS)
@@ -95,5 +100,7 @@ def test_issues_have_texts() -> None:
         *_FAULT_KEYS.values(),
         LOST,
         NOT_STORED,
+        SECOND_MASTER,
+        SUPPLY_LOST,
         TIMEOUT_RAISED,
     }

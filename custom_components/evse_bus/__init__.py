@@ -17,6 +17,7 @@ from .coordinator import BusCoordinator, EvseBusConfigEntry
 from .errors import not_ready
 from .evse.errors import LineError
 from .orders import OrderStore
+from .setup import made_of
 
 CONFIG_SCHEMA = cv.config_entry_only_config_schema(DOMAIN)
 
@@ -24,6 +25,7 @@ PLATFORMS: Final = [
     Platform.BINARY_SENSOR,
     Platform.BUTTON,
     Platform.NUMBER,
+    Platform.SELECT,
     Platform.SENSOR,
     Platform.SWITCH,
 ]
@@ -53,7 +55,7 @@ async def async_setup_entry(hass: HomeAssistant, entry: EvseBusConfigEntry) -> b
         raise
     entry.async_on_unload(entry.add_update_listener(_async_updated))
     entry.async_on_unload(
-        hass.bus.async_listen_once(EVENT_HOMEASSISTANT_STOP, coordinator.async_stop)
+        hass.bus.async_listen_once(EVENT_HOMEASSISTANT_STOP, coordinator.async_shutdown)
     )
     return True
 
@@ -88,7 +90,8 @@ async def async_remove_config_entry_device(
 async def _async_updated(hass: HomeAssistant, entry: EvseBusConfigEntry) -> None:
     """Follow a changed set-up, without silencing chargers that did not change."""
     coordinator = entry.runtime_data
-    if dict(entry.data) != coordinator.data:
+    if made_of(entry.data) != coordinator.data:
         hass.config_entries.async_schedule_reload(entry.entry_id)
         return
+    await coordinator.async_follow_supply()
     await coordinator.async_match_subentries()

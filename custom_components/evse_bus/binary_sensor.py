@@ -21,7 +21,9 @@ from .entity import (
     add_charger_entities,
     supported,
 )
-from .evse.model import Capability, ConnectorReading
+from .evse.duty import Duty
+from .evse.model import Capability, ConnectorReading, Fault
+from .sensor_tables import WAITING
 from .unit import ChargerUnit
 
 PARALLEL_UPDATES = 0
@@ -59,6 +61,12 @@ ORDERS_EXPIRED: Final = BinarySensorEntityDescription(
     translation_key="orders_expired",
     entity_category=EntityCategory.DIAGNOSTIC,
 )
+SECOND_MASTER: Final = BinarySensorEntityDescription(
+    key="second_master",
+    translation_key="second_master",
+    device_class=BinarySensorDeviceClass.PROBLEM,
+    entity_category=EntityCategory.DIAGNOSTIC,
+)
 CONNECTED: Final = BinarySensorEntityDescription(
     key="connected",
     device_class=BinarySensorDeviceClass.CONNECTIVITY,
@@ -72,7 +80,10 @@ async def async_setup_entry(
     async_add_entities: AddConfigEntryEntitiesCallback,
 ) -> None:
     """Set up the binary sensors of a bus and of its chargers."""
-    async_add_entities([ConnectedSensor(entry.runtime_data, CONNECTED)])
+    coordinator = entry.runtime_data
+    async_add_entities([ConnectedSensor(coordinator, CONNECTED)])
+    if (duty := coordinator.bus.duty) is not None:
+        async_add_entities([SecondMasterSensor(coordinator, duty)])
     add_charger_entities(
         Platform.BINARY_SENSOR, entry, async_add_entities, _sensors, _unwanted
     )
@@ -105,8 +116,26 @@ class ConnectedSensor(BusEntity, BinarySensorEntity):
         return self._attr_is_on
 
 
+class SecondMasterSensor(BusEntity, BinarySensorEntity):
+    """Whether somebody else also plays the master, so that we keep silent."""
+
+    def __init__(self, coordinator: BusCoordinator, duty: Duty) -> None:
+        """Belong to the bus."""
+        super().__init__(coordinator, SECOND_MASTER)
+        self._duty = duty
+
+    @override
+    def show(self) -> Hashable:
+        """Show what was noticed."""
+        self._attr_is_on = Fault.SECOND_MASTER in self._duty.noticed
+        return self._attr_is_on
+
+
 class ProblemSensor(ChargerEntity, BinarySensorEntity):
-    """Whether there is any fault, told by the charger or noticed by us."""
+    """Whether there is any fault, told by the charger or noticed by us.
+
+    A box that waits for current or for the sun is not at fault.
+    """
 
     @override
     def is_available(self) -> bool:
@@ -116,7 +145,7 @@ class ProblemSensor(ChargerEntity, BinarySensorEntity):
     @override
     def show(self) -> Hashable:
         """Show whether there is a fault."""
-        self._attr_is_on = bool(self.charger.faults)
+        self._attr_is_on = bool(self.charger.faults - WAITING)
         return self._attr_is_on
 
 

@@ -7,7 +7,6 @@ when something of that context changed.
 
 import asyncio
 from collections.abc import Callable
-from dataclasses import replace
 from datetime import datetime, timedelta
 from functools import partial
 from typing import Any, Final, override
@@ -21,26 +20,22 @@ from homeassistant.helpers.update_coordinator import BaseDataUpdateCoordinatorPr
 from .const import CONF_SERIAL, LOGGER, SUBENTRY_CHARGER
 from .devices import BusDevices, connector_key
 from .evse.listeners import tell
-from .evse.model import ChargerConfig, Orders
+from .evse.model import Orders, Supply
+from .farewell import async_say_farewell
 from .issues import BusIssues
 from .orders import OrderStore
 from .setup import (
+    changes_in_place,
     charger_config,
     charger_unique_id,
     first_orders,
     line_settings,
+    made_of,
     protocol_of,
+    supply_of,
 )
+from .supply import SharedSupply
 from .unit import ChargerUnit
-
-_IN_PLACE: Final = (
-    "name",
-    "installation_limit",
-    "voltage",
-    "poll_interval",
-    "order_lifetime",
-)
-"""What of its set-up a charger looks up anew each time."""
 
 type EvseBusConfigEntry = ConfigEntry[BusCoordinator]
 type Context = tuple[str, int | None]
@@ -60,20 +55,30 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         self.hass = hass
         self.entry = entry
         self.port: str = entry.data[CONF_DEVICE]
-        self.data = dict(entry.data)
+        self.data = made_of(entry.data)
         """What the bus was made of: when that changes, it is made anew."""
         self.protocol = protocol_of(entry.data)
+        installed = supply_of(entry.data)
         self.bus = self.protocol.bus(
-            self.port, settings=line_settings(entry.data), name=entry.title
+            self.port,
+            settings=line_settings(entry.data),
+            name=entry.title,
+            supply=installed,
         )
         self.units: dict[str, ChargerUnit] = {}
         self.issues = BusIssues(hass, entry)
         self.devices = BusDevices(hass, entry, self.protocol.name)
         self.orders = OrderStore(hass, entry.entry_id, self.issues.orders_written)
+        self.supply = (
+            SharedSupply(installed, self.orders, self._async_share)
+            if installed
+            else None
+        )
+        """What the chargers share; ``None``: each is on its own."""
         self._listeners: dict[Context, list[CALLBACK_TYPE]] = {}
         self._adders: list[Callable[[ChargerUnit], None]] = []
         self._stop_statistics: CALLBACK_TYPE | None = None
-        self._unsubscribe_bus: CALLBACK_TYPE = lambda: None
+        self._unsubscribe: list[CALLBACK_TYPE] = []
         self._changing = asyncio.Lock()
         self._stopped = False
 
@@ -82,22 +87,62 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
     async def async_start(self) -> None:
         """Load the orders, then open the port; raises LineError."""
         await self.orders.async_load()
+        await self._async_begin_sharing()
         await self.async_match_subentries()
-        self._unsubscribe_bus = self.bus.subscribe(partial(self._notify, BUS))
+        self._unsubscribe.append(self.bus.subscribe(partial(self._notify, BUS)))
         await self.bus.start()
 
-    async def async_stop(self, _event: Event | None = None) -> None:
+    async def _async_begin_sharing(self) -> None:
+        if self.supply is None or self.bus.duty is None:
+            return
+        # Its device outlives restarts: there is one, so there was an order.
+        new = not self.devices.has(self.entry.entry_id)
+        if not await self.supply.async_begin(new=new):
+            self.issues.supply_lost(self.supply.limit)
+        self._unsubscribe.append(self.bus.duty.subscribe(self._on_duty))
+
+    async def async_shutdown(self, _event: Event) -> None:
+        """Stop with Home Assistant: chargers that are to be told so are told."""
+        await async_say_farewell([unit.charger for unit in self.units.values()])
+        await self.async_stop()
+
+    async def async_stop(self) -> None:
         """Close the port and leave nothing behind."""
         async with self._changing:
             self._stopped = True
-            self._unsubscribe_bus()
-            self._unsubscribe_bus = lambda: None
+            while self._unsubscribe:
+                self._unsubscribe.pop()()
             await self.bus.stop()
             for unit in self.units.values():
                 unit.unsubscribe()
                 unit.unsubscribe = lambda: None
             await self.orders.async_close()
             self.issues.clear()
+
+    # -- What all chargers share -------------------------------------------------
+
+    async def async_follow_supply(self) -> None:
+        """Share what the set-up says now."""
+        installed = supply_of(self.entry.data)
+        if self.supply is not None and installed is not None:
+            await self.supply.async_set_up(installed)
+
+    async def async_order_supply(self, value: float) -> None:
+        """Let the chargers share this much, A a phase; raises RefusedOrderError."""
+        if self.supply is not None:
+            await self.supply.async_order(value)
+            self.issues.supply_renewed()
+
+    async def _async_share(self, supply: Supply) -> None:
+        self._notify(BUS)
+        if self.bus.duty is not None:
+            await self.bus.duty.change_supply(supply)
+
+    @callback
+    def _on_duty(self) -> None:
+        if self.bus.duty is not None:
+            self.issues.check_bus(self.bus.duty.noticed)
+        self._notify(BUS)
 
     # -- Chargers come, change and go --------------------------------------------
 
@@ -160,7 +205,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         if config == old.config:
             return
         LOGGER.debug("%s: its set-up was changed", config.name)
-        if _changes_in_place(old.config, config):
+        if changes_in_place(old.config, config):
             old.set_up(config)
             self.devices.show_charger(unit)
             self._on_charger(unit)
@@ -207,6 +252,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
             charger.config.order_lifetime is None,
             frozenset(unit.numbers),
             charger.info,
+            frozenset(charger.settings),
         )
         if shape == unit.shape:
             return
@@ -308,15 +354,3 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
     @callback
     def _notify(self, context: Context) -> None:
         tell(self._listeners.get(context, ()))
-
-
-def _changes_in_place(old: ChargerConfig, new: ChargerConfig) -> bool:
-    """Return whether a charger can be told its new set-up while it runs.
-
-    What decides how it is spoken to is asked for once, when it is made. A serial
-    number that becomes known is the one it has found itself.
-    """
-    same = {name: getattr(old, name) for name in _IN_PLACE}
-    if old.serial is None:
-        same["serial"] = None
-    return type(old) is type(new) and replace(new, **same) == old

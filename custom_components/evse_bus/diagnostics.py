@@ -1,10 +1,9 @@
 """Diagnostics: all that helps to find a fault, without what identifies a house."""
 
-from collections.abc import Iterable, Mapping, Set as AbstractSet
+from collections.abc import Mapping, Set as AbstractSet
 from dataclasses import fields, is_dataclass
 from datetime import UTC, datetime
 from math import isfinite
-import re
 from typing import Any, Final
 
 from homeassistant.components.diagnostics import REDACTED, async_redact_data
@@ -15,24 +14,13 @@ from homeassistant.helpers.device_registry import ChildDeviceEntry, DeviceEntry
 from .const import CONF_SERIAL, DOMAIN
 from .coordinator import BusCoordinator, EvseBusConfigEntry
 from .evse.statistics import Direction
+from .redaction import on_wire, without_serial
 from .unit import ChargerUnit
 
 # An adapter's path and a network address name the house as a serial number does.
 # An EVBox is addressed by its serial number.
 _PRIVATE: Final = {CONF_DEVICE, CONF_SERIAL, "serials", "information"}
 _PRIVATE_ADDRESS: Final = {"evbox"}
-
-_SERIAL_IN_FRAME: Final[Mapping[str, re.Pattern[bytes]]] = {
-    # EVBox: eight digits behind command 68; fewer where a frame was cut off.
-    "evbox": re.compile(rb"(?<=68)[0-9]{8}|(?<=A08068|80A068)[0-9]{1,8}"),
-    # ABL: the answer to a read of register 0x50, whose first byte repeats the 50.
-    "abl": re.compile(rb"(?<=03[0-9A-F]{2}50)[0-9A-F]+"),
-}
-_REST_OF_SERIAL: Final[Mapping[str, re.Pattern[bytes]]] = {
-    "evbox": re.compile(rb"\A[0-9]{1,8}"),
-    "abl": re.compile(rb"\A[0-9A-F]+"),
-}
-"""What a piece without its beginning may begin with."""
 
 
 async def async_get_config_entry_diagnostics(
@@ -105,7 +93,10 @@ def _charger(coordinator: BusCoordinator, unit: ChargerUnit) -> dict[str, Any]:
 
 def _frames(coordinator: BusCoordinator) -> list[dict[str, str]]:
     protocol = coordinator.protocol.key
-    serials = _serials(coordinator)
+    chargers = [unit.charger for unit in coordinator.units.values()]
+    told = {one.config.serial for one in chargers}
+    told |= {one.info.serial for one in chargers if one.info is not None}
+    serials = on_wire(protocol, told)
     return [
         {
             "time": datetime.fromtimestamp(frame.when, UTC).isoformat(),
@@ -119,39 +110,6 @@ def _frames(coordinator: BusCoordinator) -> list[dict[str, str]]:
         }
         for frame in coordinator.bus.wire.frames
     ]
-
-
-def _serials(coordinator: BusCoordinator) -> list[bytes]:
-    """Return the serial numbers known, as they pass on the wire."""
-    chargers = [unit.charger for unit in coordinator.units.values()]
-    told = {one.config.serial for one in chargers}
-    told |= {one.info.serial for one in chargers if one.info is not None}
-    known = [serial for serial in told if serial]
-    if coordinator.protocol.key in _PRIVATE_ADDRESS:
-        return [serial.zfill(8).encode() for serial in known]
-    return [serial.encode().hex().upper().encode() for serial in known]
-
-
-def without_serial(
-    protocol: str,
-    data: bytes,
-    serials: Iterable[bytes] = (),
-    *,
-    whole: bool = True,
-) -> bytes:
-    """Return bytes as they passed, serial numbers replaced by asterisks.
-
-    ``serials`` are hidden wherever they stand, also in a damaged frame. A piece
-    that is not ``whole`` may begin in the middle of one.
-    """
-    for serial in serials:
-        data = data.replace(serial, b"*" * len(serial))
-    data = _SERIAL_IN_FRAME[protocol].sub(_hide, data)
-    return data if whole else _REST_OF_SERIAL[protocol].sub(_hide, data)
-
-
-def _hide(found: re.Match[bytes]) -> bytes:
-    return b"*" * len(found.group())
 
 
 def plain(value: object) -> Any:  # noqa: ANN401 - JSON has no better type

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
 
     from .evse.charger import Charger
-    from .evse.model import Capability, ConnectorReading
+    from .evse.model import Capability, ConnectorReading, Range, Setting
 
 
 _GROWING: Final = (ConfigEntryState.SETUP_IN_PROGRESS, ConfigEntryState.LOADED)
@@ -192,6 +192,37 @@ class ChargerEntity(EvseBusEntity):
     def is_available(self) -> bool:
         """Return whether the charger answers."""
         return self.charger.available
+
+
+class SettingEntity(ChargerEntity):
+    """Something that a box keeps in its own memory."""
+
+    def __init__(
+        self,
+        coordinator: BusCoordinator,
+        unit: ChargerUnit,
+        description: EntityDescription,
+        setting: Setting,
+    ) -> None:
+        """Belong to the charger's device."""
+        super().__init__(coordinator, unit, description)
+        self.setting = setting
+
+    @property
+    def told(self) -> int | None:
+        """Return what the box told; ``None``: it was not read."""
+        reading = self.charger.reading
+        return None if reading is None else reading.settings.get(self.setting)
+
+    @property
+    def reach(self) -> Range:
+        """Return from where to where it can be set."""
+        return self.charger.settings[self.setting]
+
+    @override
+    def is_available(self) -> bool:
+        """Return whether the charger answers and has this setting still."""
+        return super().is_available() and self.setting in self.charger.settings
 
 
 class ConnectorEntity(ChargerEntity):

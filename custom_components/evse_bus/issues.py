@@ -9,7 +9,7 @@ from .evse.model import Fault, Orders
 from .evse.safety import INTERVALS_PER_TIMEOUT
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Set as AbstractSet
 
     from homeassistant.config_entries import ConfigEntry
     from homeassistant.core import HomeAssistant
@@ -18,11 +18,14 @@ if TYPE_CHECKING:
 
 NOT_STORED: Final = "orders_not_stored"
 LOST: Final = "orders_lost"
+SUPPLY_LOST: Final = "supply_lost"
 TIMEOUT_RAISED: Final = "timeout_raised"
+SECOND_MASTER: Final = "second_master"
 
 _FAULT_KEYS: Final[Mapping[Fault, str]] = {
     Fault.WRONG_CHARGER: "wrong_charger",
     Fault.DUPLICATE_ADDRESS: "duplicate_address",
+    Fault.UNSUPPORTED_FIRMWARE: "unsupported_firmware",
 }
 
 
@@ -59,6 +62,28 @@ class BusIssues:
     def orders_renewed(self, unit: ChargerUnit) -> None:
         """Note that somebody has given a charger orders again."""
         self._set(LOST, unit.subentry_id, present=False)
+
+    def supply_lost(self, current: float) -> None:
+        """Note that the stored order about a bus's supply was not there."""
+        self._set(
+            SUPPLY_LOST,
+            self._entry.entry_id,
+            present=True,
+            placeholders={"bus": self._entry.title, "current": f"{current:g}"},
+        )
+
+    def supply_renewed(self) -> None:
+        """Note that somebody has said again what a bus shares."""
+        self._set(SUPPLY_LOST, self._entry.entry_id, present=False)
+
+    def check_bus(self, noticed: AbstractSet[Fault]) -> None:
+        """Note what was noticed of the whole bus."""
+        self._set(
+            SECOND_MASTER,
+            self._entry.entry_id,
+            present=Fault.SECOND_MASTER in noticed,
+            placeholders={"bus": self._entry.title},
+        )
 
     def check(self, unit: ChargerUnit) -> None:
         """Note what a charger told, or what was noticed of it."""

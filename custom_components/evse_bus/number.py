@@ -1,170 +1,35 @@
-"""Numbers: limits and fail-safe values, as the user wants them to stand.
+"""Numbers: limits, fail-safe values, the settings of a box, what a bus shares.
 
-They show orders, never a reading: a slider that followed what the charger just
+Limits show orders, never a reading: a slider that followed what the charger just
 offers would go down with it and not come up again.
 """
 
-from collections.abc import Callable, Hashable, Iterable
-from dataclasses import dataclass
+from collections.abc import Hashable, Iterable
 from functools import partial
-from typing import Any, Final, override
+from typing import override
 
-from homeassistant.components.number import (
-    NumberDeviceClass,
-    NumberEntity,
-    NumberEntityDescription,
-    NumberMode,
-)
-from homeassistant.const import (
-    EntityCategory,
-    Platform,
-    UnitOfElectricCurrent,
-    UnitOfTime,
-)
+from homeassistant.components.number import NumberEntity
+from homeassistant.const import Platform
 from homeassistant.core import HomeAssistant
 from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
 
 from .coordinator import BusCoordinator, EvseBusConfigEntry
-from .entity import ChargerEntity, add_charger_entities
+from .entity import BusEntity, ChargerEntity, SettingEntity, add_charger_entities
 from .errors import translated_errors
-from .evse.charger import Charger
-from .evse.model import Capability, CurrentLimit, Limits, OrderChange, Orders, Phases
-from .evse.safety import number
+from .number_tables import (
+    FAIL_SAFE_CURRENT,
+    NUMBERS,
+    SETTINGS,
+    SUPPLY,
+    OrderNumberDescription,
+    SettingNumberDescription,
+    falls_back,
+    whole,
+)
+from .supply import STEP, SharedSupply
 from .unit import ChargerUnit
 
 PARALLEL_UPDATES = 0
-
-LONGEST_TIMEOUT: Final = 3600
-"""Longest fail-safe time-out offered, s; a longer one would hardly be safe."""
-SHORTEST_STEP: Final = 0.1
-"""Finest step of a slider, A; what a protocol cannot say is rounded down."""
-
-FAIL_SAFE_CURRENT: Final = "fail_safe_current"
-
-
-def ceiling(limits: Limits) -> float:
-    """Return the highest current that may be asked for, A.
-
-    A maximum that the charger has not told yet does not count here: until it has,
-    6 A reach the wire whatever the order says.
-    """
-    if limits.reported is None:
-        return limits.installation
-    return min(limits.installation, limits.reported)
-
-
-@dataclass(frozen=True, kw_only=True)
-class OrderNumberDescription(NumberEntityDescription):
-    """One number of a charger's orders."""
-
-    exists: Callable[[Charger], bool] = lambda _charger: True
-    value: Callable[[Orders, Limits], float]
-    change: Callable[[float], OrderChange]
-    lowest: Callable[[Limits], float] = lambda _limits: 0.0
-    highest: Callable[[Limits], float] = ceiling
-    finest: Callable[[Limits], float] = lambda limits: max(limits.step, SHORTEST_STEP)
-
-
-_CURRENT: Final[dict[str, Any]] = {
-    "device_class": NumberDeviceClass.CURRENT,
-    "native_unit_of_measurement": UnitOfElectricCurrent.AMPERE,
-    "mode": NumberMode.SLIDER,
-}
-
-
-def _one_phase(index: int, value: float) -> Phases[float | None]:
-    one, two, three = (value if at == index else None for at in range(3))
-    return one, two, three
-
-
-def _limit_of(index: int, limit: CurrentLimit, limits: Limits) -> float:
-    """Return a phase's own limit; without one nothing but the ceiling limits it."""
-    own = limit.phases[index]
-    return ceiling(limits) if own is None else min(own, ceiling(limits))
-
-
-def _has(capability: Capability) -> Callable[[Charger], bool]:
-    return lambda charger: capability in charger.capabilities
-
-
-def _falls_back(charger: Charger) -> bool:
-    """Return whether a fail-safe current counts: the box's or an order's lifetime's."""
-    return (
-        Capability.FAIL_SAFE_CURRENT in charger.capabilities
-        or charger.config.order_lifetime is not None
-    )
-
-
-def _falls_back_per_phase(charger: Charger) -> bool:
-    return {Capability.FAIL_SAFE_CURRENT, Capability.PHASE_LIMITS} <= (
-        charger.capabilities
-    )
-
-
-def _phase_limit(index: int) -> OrderNumberDescription:
-    return OrderNumberDescription(
-        key=f"limit_l{index + 1}",
-        translation_key="limit_phase",
-        translation_placeholders={"phase": f"L{index + 1}"},
-        exists=_has(Capability.PHASE_LIMITS),
-        value=lambda orders, limits: _limit_of(index, orders.limit, limits),
-        change=lambda value: OrderChange(phases=_one_phase(index, value)),
-        **_CURRENT,
-    )
-
-
-def _phase_fail_safe(index: int) -> OrderNumberDescription:
-    return OrderNumberDescription(
-        key=f"fail_safe_current_l{index + 1}",
-        translation_key="fail_safe_current_phase",
-        translation_placeholders={"phase": f"L{index + 1}"},
-        entity_category=EntityCategory.CONFIG,
-        entity_registry_enabled_default=False,
-        exists=_falls_back_per_phase,
-        value=lambda orders, limits: _limit_of(index, orders.fail_safe, limits),
-        change=lambda value: OrderChange(fail_safe_phases=_one_phase(index, value)),
-        **_CURRENT,
-    )
-
-
-NUMBERS: Final[tuple[OrderNumberDescription, ...]] = (
-    OrderNumberDescription(
-        key="charging_current",
-        translation_key="charging_current",
-        value=lambda orders, limits: min(orders.limit.current, ceiling(limits)),
-        change=lambda value: OrderChange(current=value),
-        lowest=lambda limits: limits.minimum,
-        **_CURRENT,
-    ),
-    *(_phase_limit(index) for index in range(3)),
-    OrderNumberDescription(
-        key=FAIL_SAFE_CURRENT,
-        translation_key="fail_safe_current",
-        entity_category=EntityCategory.CONFIG,
-        exists=_falls_back,
-        value=lambda orders, limits: min(orders.fail_safe.current, ceiling(limits)),
-        change=lambda value: OrderChange(fail_safe_current=value),
-        **_CURRENT,
-    ),
-    *(_phase_fail_safe(index) for index in range(3)),
-    OrderNumberDescription(
-        key="fail_safe_timeout",
-        translation_key="fail_safe_timeout",
-        entity_category=EntityCategory.CONFIG,
-        device_class=NumberDeviceClass.DURATION,
-        native_unit_of_measurement=UnitOfTime.SECONDS,
-        mode=NumberMode.BOX,
-        exists=_has(Capability.FAIL_SAFE_TIMEOUT),
-        value=lambda orders, _limits: orders.fail_safe_timeout,
-        # int() would raise something else for NaN.
-        change=lambda value: OrderChange(
-            fail_safe_timeout=int(number(value, "fail-safe time-out"))
-        ),
-        lowest=lambda _limits: 1,
-        highest=lambda _limits: LONGEST_TIMEOUT,
-        finest=lambda _limits: 1,
-    ),
-)
 
 
 async def async_setup_entry(
@@ -172,19 +37,24 @@ async def async_setup_entry(
     entry: EvseBusConfigEntry,
     async_add_entities: AddConfigEntryEntitiesCallback,
 ) -> None:
-    """Set up the numbers of a bus's chargers."""
+    """Set up the numbers of a bus and of its chargers."""
+    if (supply := entry.runtime_data.supply) is not None:
+        async_add_entities([SupplyNumber(entry.runtime_data, supply)])
     add_charger_entities(
         Platform.NUMBER, entry, async_add_entities, _numbers, _unwanted
     )
 
 
 def _numbers(coordinator: BusCoordinator, unit: ChargerUnit) -> Iterable[NumberEntity]:
-    make = partial(OrderNumber, coordinator, unit)
-    return (make(entry) for entry in NUMBERS if entry.exists(unit.charger))
+    order = partial(OrderNumber, coordinator, unit)
+    yield from (order(entry) for entry in NUMBERS if entry.exists(unit.charger))
+    setting = partial(SettingNumber, coordinator, unit)
+    there = unit.charger.settings
+    yield from (setting(entry) for entry in SETTINGS if entry.setting in there)
 
 
 def _unwanted(unit: ChargerUnit) -> Iterable[str]:
-    return () if _falls_back(unit.charger) else (FAIL_SAFE_CURRENT,)
+    return () if falls_back(unit.charger) else (FAIL_SAFE_CURRENT,)
 
 
 class OrderNumber(ChargerEntity, NumberEntity):
@@ -216,3 +86,55 @@ class OrderNumber(ChargerEntity, NumberEntity):
         """Order a value; return when the charger follows it."""
         with translated_errors(self.unit.name, self.coordinator.port):
             await self.charger.change_orders(self._order.change(value))
+
+
+class SettingNumber(SettingEntity, NumberEntity):
+    """A number that a box keeps in its own memory."""
+
+    def __init__(
+        self,
+        coordinator: BusCoordinator,
+        unit: ChargerUnit,
+        description: SettingNumberDescription,
+    ) -> None:
+        """Belong to the charger."""
+        super().__init__(coordinator, unit, description, description.setting)
+
+    @override
+    def show(self) -> Hashable:
+        """Show what the box told, and what can be set."""
+        reach = self.reach
+        self._attr_native_value = self.told
+        self._attr_native_min_value = reach.minimum
+        self._attr_native_max_value = reach.maximum
+        return (self.told, reach)
+
+    @override
+    async def async_set_native_value(self, value: float) -> None:
+        """Write it into the box; return when it is read back."""
+        with translated_errors(self.unit.name, self.coordinator.port):
+            await self.charger.configure(self.setting, whole(value))
+
+
+class SupplyNumber(BusEntity, NumberEntity):
+    """What all chargers of a bus may draw together, A a phase."""
+
+    _attr_native_step = STEP
+
+    def __init__(self, coordinator: BusCoordinator, supply: SharedSupply) -> None:
+        """Belong to the bus."""
+        super().__init__(coordinator, SUPPLY)
+        self._supply = supply
+
+    @override
+    def show(self) -> Hashable:
+        """Show the order that counts, and what may be asked for."""
+        self._attr_native_value = self._supply.limit
+        self._attr_native_max_value = self._supply.installed.limit
+        return (self._attr_native_value, self._attr_native_max_value)
+
+    @override
+    async def async_set_native_value(self, value: float) -> None:
+        """Order it; return when it counts."""
+        with translated_errors(self.coordinator.entry.title, self.coordinator.port):
+            await self.coordinator.async_order_supply(value)

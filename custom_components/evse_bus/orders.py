@@ -1,4 +1,4 @@
-"""The orders of a bus's chargers on disk.
+"""The orders of a bus and of its chargers on disk.
 
 Entity states are restored from minutes ago after a crash, and not at all for a
 disabled entity; a limit is a promise. So orders have a file of their own, one a
@@ -7,6 +7,7 @@ charger has confirmed it, since losing one only means a lower limit.
 """
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any, Final, override
 
 from homeassistant.core import HomeAssistant
@@ -38,7 +39,7 @@ _UNREADABLE = (
 
 
 class OrderStore:
-    """The stored orders of all chargers of one config entry."""
+    """The stored orders of one config entry: of all chargers, and of the bus."""
 
     def __init__(
         self,
@@ -48,12 +49,15 @@ class OrderStore:
     ) -> None:
         """Read nothing yet; ``on_write`` is told how each write went."""
         self._store = _WatchedStore(hass, entry_id, on_write)
+        self._bus_key = entry_id
         self._orders: dict[str, Orders] = {}
+        self._supply: SupplyOrder | None = None
         self._pending = False
 
     async def async_load(self) -> None:
         """Read the file; one that cannot be read counts as none."""
         self._orders = {}
+        self._supply = None
         try:
             stored = await self._store.async_load()
             records = dict(stored or {})
@@ -62,13 +66,21 @@ class OrderStore:
             return
         for key, record in records.items():
             try:
-                self._orders[key] = decode(record)
+                if key == self._bus_key:
+                    self._supply = decode_supply(record)
+                else:
+                    self._orders[key] = decode(record)
             except (RefusedOrderError, *_UNREADABLE) as error:
                 LOGGER.error("A stored order cannot be used: %s", error)
 
     def get(self, key: str) -> Orders | None:
         """Return a charger's orders; ``None``: there are no usable ones."""
         return self._orders.get(key)
+
+    @property
+    def supply(self) -> SupplyOrder | None:
+        """Return the order about what the bus shares; ``None``: no usable one."""
+        return self._supply
 
     async def async_commit(self, key: str, orders: Orders) -> None:
         """Keep a charger's orders: a lowering is on disk when this returns.
@@ -80,11 +92,25 @@ class OrderStore:
         if orders == before:
             return
         self._orders[key] = orders
-        if before is None or cautious(before, orders) == orders:
+        await self._write(
+            soon=before is not None and cautious(before, orders) != orders
+        )
+
+    async def async_commit_supply(self, supply: SupplyOrder) -> None:
+        """Keep what the bus shares; otherwise as `async_commit`."""
+        before = self._supply
+        if supply == before:
+            return
+        self._supply = supply
+        await self._write(soon=before is not None and supply.raises(before))
+
+    async def _write(self, *, soon: bool) -> None:
+        """Write now, or ``soon``: together with what comes next."""
+        if not soon:
             await self.async_flush()
-        else:
-            self._pending = True
-            self._store.async_delay_save(self._encoded, RAISE_DELAY)
+            return
+        self._pending = True
+        self._store.async_delay_save(self._encoded, RAISE_DELAY)
 
     async def async_keep_only(self, keys: Iterable[str]) -> None:
         """Forget the orders of chargers that are no more."""
@@ -110,7 +136,24 @@ class OrderStore:
         await self._store.async_remove()
 
     def _encoded(self) -> _Stored:
-        return {key: encode(orders) for key, orders in self._orders.items()}
+        encoded = {key: encode(orders) for key, orders in self._orders.items()}
+        if self._supply is not None:
+            encoded[self._bus_key] = {"supply": self._supply.limit}
+        return encoded
+
+
+@dataclass(frozen=True, slots=True)
+class SupplyOrder:
+    """What the chargers of a bus may draw together, as the user wants it to stand."""
+
+    limit: float | None
+    """A a phase; ``None``: nobody has said so, all that the installation gives."""
+
+    def raises(self, before: SupplyOrder) -> bool:
+        """Return whether this allows more than another one."""
+        if self.limit is None or before.limit is None:
+            return self.limit is None and before.limit is not None
+        return self.limit > before.limit
 
 
 class _WatchedStore(Store[_Stored]):
@@ -168,6 +211,12 @@ def decode(record: Mapping[str, Any]) -> Orders:
         fail_safe=_decode_limit(record["fail_safe"]),
         fail_safe_timeout=int(number(record["fail_safe_timeout"], "time-out")),
     )
+
+
+def decode_supply(record: Mapping[str, Any]) -> SupplyOrder:
+    """Return a stored order about the supply; raises as `decode` does."""
+    stored = record["supply"]
+    return SupplyOrder(None if stored is None else number(stored, "supply"))
 
 
 def _encode_limit(limit: CurrentLimit) -> dict[str, Any]:

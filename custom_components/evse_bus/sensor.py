@@ -40,6 +40,7 @@ from .sensor_tables import (
     ESTIMATED_ENERGY,
     FAULT,
     NO_FAULT,
+    WAITING,
     BusSensorDescription,
     ChargerSensorDescription,
     ConnectorSensorDescription,
@@ -148,8 +149,9 @@ class FaultSensor(ChargerEntity, SensorEntity):
 
     @override
     def show(self) -> Hashable:
-        """Show the first fault in the order of their list."""
+        """Show the first fault in the order of their list; waiting comes last."""
         faults = [fault for fault in Fault if fault in self.charger.faults]
+        faults.sort(key=lambda fault: fault in WAITING)
         reading = self.charger.reading
         codes = reading.fault_codes if reading else ()
         self._attr_native_value = faults[0] if faults else NO_FAULT

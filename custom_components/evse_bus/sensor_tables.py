@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any, Final
 
 from homeassistant.components.sensor import (
@@ -16,6 +17,7 @@ from homeassistant.const import (
     UnitOfElectricPotential,
     UnitOfEnergy,
     UnitOfPower,
+    UnitOfTemperature,
     UnitOfTime,
 )
 
@@ -31,6 +33,19 @@ from .evse.model import (
 )
 
 NO_FAULT: Final = "none"
+
+WAITING: Final = frozenset({Fault.LESS_6A, Fault.NO_CURRENT, Fault.NO_SUN})
+"""What a box tells among its faults, and is none: it waits for current or the sun."""
+
+
+class FailSafe(StrEnum):
+    """What a charger does when it no longer hears from Home Assistant."""
+
+    NOTHING = "nothing"
+    """The last limit stands."""
+    FALLS_BACK = "falls_back"
+    """It charges with its fail-safe current after its time-out."""
+    STOPS = "stops"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,6 +150,22 @@ def _per_phase(
     )
 
 
+def _fail_safe(charger: Charger) -> FailSafe | None:
+    """Return what a charger does in silence; ``None``: that is not known yet."""
+    # A fail-safe current alone may be just for orders that nobody renews.
+    if Capability.FAIL_SAFE_TIMEOUT in charger.capabilities:
+        return FailSafe.FALLS_BACK
+    if charger.bus is not None and charger.bus.duty is not None:
+        # A slave without its master.
+        return FailSafe.STOPS
+    if Capability.UPSTREAM_TIMEOUT not in charger.capabilities:
+        return FailSafe.NOTHING
+    own = charger.info.options.get("upstream_timeout") if charger.info else None
+    if own is None:
+        return None
+    return FailSafe.STOPS if own else FailSafe.NOTHING
+
+
 CONNECTOR_SENSORS: Final[tuple[ConnectorSensorDescription, ...]] = (
     ConnectorSensorDescription(
         key="status",
@@ -183,6 +214,7 @@ CONNECTOR_SENSORS: Final[tuple[ConnectorSensorDescription, ...]] = (
     ),
 )
 
+
 ENERGY: Final = SensorEntityDescription(key="energy", **_ENERGY)
 ESTIMATED_ENERGY: Final = SensorEntityDescription(
     key="estimated_energy", translation_key="estimated_energy", **_ENERGY
@@ -203,6 +235,23 @@ CHARGER_SENSORS: Final[tuple[ChargerSensorDescription, ...]] = (
         capability=Capability.MAXIMUM_CURRENT,
         value=_told(lambda reading: reading.maximum_current),
         **_CURRENT,
+    ),
+    ChargerSensorDescription(
+        key="temperature",
+        entity_category=EntityCategory.DIAGNOSTIC,
+        device_class=SensorDeviceClass.TEMPERATURE,
+        native_unit_of_measurement=UnitOfTemperature.CELSIUS,
+        state_class=SensorStateClass.MEASUREMENT,
+        capability=Capability.TEMPERATURE,
+        value=_told(lambda reading: reading.temperature),
+    ),
+    ChargerSensorDescription(
+        key="fail_safe",
+        translation_key="fail_safe",
+        entity_category=EntityCategory.DIAGNOSTIC,
+        device_class=SensorDeviceClass.ENUM,
+        options=[str(one) for one in FailSafe],
+        value=_fail_safe,
     ),
 )
 

@@ -1,6 +1,7 @@
 """From what the config flow stored to what the library is set up with. Pure."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any, Final
 
 from homeassistant.const import CONF_ADDRESS
@@ -19,6 +20,9 @@ from .const import (
     CONF_PROTOCOL,
     CONF_SERIAL,
     CONF_STOP_BITS,
+    CONF_STOP_ON_SHUTDOWN,
+    CONF_SUPPLY_LIMIT,
+    CONF_SUPPLY_MINIMUM,
     CONF_VOLTAGE,
 )
 from .evse.framing import LineSettings
@@ -27,6 +31,7 @@ from .evse.model import (
     ChargerConfig,
     CurrentLimit,
     Orders,
+    Supply,
 )
 from .evse.protocols import PROTOCOLS
 
@@ -44,8 +49,21 @@ _OPTIONAL_FIELDS: Final[Mapping[str, Callable[[Any], object]]] = {
     CONF_COMMAND: int,
     CONF_INFORMATION: bytes.fromhex,
     CONF_PHASE_ORDER: tuple,
+    CONF_STOP_ON_SHUTDOWN: bool,
 }
 """Fields that may be missing or None, and how they are made of what is stored."""
+
+_IN_PLACE: Final = (
+    "name",
+    "installation_limit",
+    "voltage",
+    "poll_interval",
+    "order_lifetime",
+    "stop_on_shutdown",
+)
+"""What of its set-up a charger looks up anew each time."""
+_BUS_IN_PLACE: Final = (CONF_SUPPLY_LIMIT, CONF_SUPPLY_MINIMUM)
+"""What can be changed while the bus runs: anew it would be silent for a while."""
 
 _DEFAULT_TIMEOUT: Final = 60
 
@@ -69,6 +87,21 @@ def line_settings(data: Mapping[str, Any]) -> LineSettings:
         baudrate=int(data.get(CONF_BAUDRATE, usual.baudrate)),
         parity=data.get(CONF_PARITY, usual.parity),
         stop_bits=int(data.get(CONF_STOP_BITS, usual.stop_bits)),
+    )
+
+
+def made_of(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what of a config entry's data its bus has to be made anew for."""
+    return {key: value for key, value in data.items() if key not in _BUS_IN_PLACE}
+
+
+def supply_of(data: Mapping[str, Any]) -> Supply | None:
+    """Return what the chargers of a bus share; ``None``: each is on its own."""
+    if protocol_of(data).duty is None:
+        return None
+    return Supply(
+        limit=float(data.get(CONF_SUPPLY_LIMIT, MINIMUM_CURRENT)),
+        minimum=float(data.get(CONF_SUPPLY_MINIMUM, MINIMUM_CURRENT)),
     )
 
 
@@ -105,3 +138,16 @@ def first_orders(subentry: ConfigSubentry) -> Orders:
         fail_safe=CurrentLimit(current=fail_safe),
         fail_safe_timeout=int(stored.get(CONF_FAIL_SAFE_TIMEOUT, _DEFAULT_TIMEOUT)),
     )
+
+
+def changes_in_place(old: ChargerConfig, new: ChargerConfig) -> bool:
+    """Return whether a charger can be told its new set-up while it runs.
+
+    What decides how it is spoken to is asked for once, when it is made. A serial
+    number that becomes known is the one it has found itself.
+    """
+    names = {one.name for one in fields(old)}.intersection(_IN_PLACE)
+    if old.serial is None:
+        names.add("serial")
+    same = {name: getattr(old, name) for name in names}
+    return type(old) is type(new) and replace(new, **same) == old

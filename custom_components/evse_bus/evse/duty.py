@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from .bus import Bus
     from .exchange import Talk
     from .framing import Frame
-    from .model import Fault
+    from .model import Fault, Supply
 
 
 class Duty(ABC):
@@ -58,6 +58,12 @@ class Duty(ABC):
     def heard(self, frame: Frame) -> bool:  # noqa: ARG002
         """Look at a frame that nobody asked for; return whether it was for us."""
         return False
+
+    async def change_supply(self, supply: Supply) -> None:  # noqa: B027 - not all share
+        """Share this much among all chargers from now on; return when they heard.
+
+        Raises RefusedOrderError for a supply that cannot be.
+        """
 
     def subscribe(self, listener: Callable[[], None]) -> Callable[[], None]:
         """Call back after each change of what is known; return how to stop."""

@@ -1,0 +1,95 @@
+"""Selects: what decides how much a box offers, now and after a power failure."""
+
+from collections.abc import Hashable, Iterable
+from typing import Final, override
+
+from homeassistant.components.select import SelectEntity, SelectEntityDescription
+from homeassistant.const import EntityCategory, Platform
+from homeassistant.core import HomeAssistant
+from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
+
+from .coordinator import BusCoordinator, EvseBusConfigEntry
+from .entity import ChargerEntity, SettingEntity, add_charger_entities
+from .errors import translated_errors
+from .evse.model import Capability, Command, Mode, Setting
+from .unit import ChargerUnit
+
+PARALLEL_UPDATES = 0
+
+MODES: Final = tuple(Mode)
+"""A box's own number of a mode is its place in here."""
+
+MODE: Final = SelectEntityDescription(
+    key="mode", translation_key="mode", options=[str(mode) for mode in MODES]
+)
+MODE_AT_START: Final = SelectEntityDescription(
+    key=f"setting_{Setting.MODE_AT_START}",
+    translation_key=f"setting_{Setting.MODE_AT_START}",
+    entity_category=EntityCategory.CONFIG,
+    # The memory of a box bears a limited number of writes.
+    entity_registry_enabled_default=False,
+    options=[str(mode) for mode in MODES],
+)
+
+
+async def async_setup_entry(
+    hass: HomeAssistant,  # noqa: ARG001 - Home Assistant's signature
+    entry: EvseBusConfigEntry,
+    async_add_entities: AddConfigEntryEntitiesCallback,
+) -> None:
+    """Set up the selects of a bus's chargers."""
+    add_charger_entities(Platform.SELECT, entry, async_add_entities, _selects)
+
+
+def _selects(coordinator: BusCoordinator, unit: ChargerUnit) -> Iterable[SelectEntity]:
+    charger = unit.charger
+    if Capability.MODE in charger.capabilities:
+        yield ModeSelect(coordinator, unit, MODE)
+    if Setting.MODE_AT_START in charger.settings:
+        yield ModeAtStartSelect(coordinator, unit, MODE_AT_START)
+
+
+class ModeSelect(ChargerEntity, SelectEntity):
+    """What decides how much the box offers; it forgets that without power."""
+
+    @override
+    def show(self) -> Hashable:
+        """Show what the box says."""
+        reading = self.charger.reading
+        self._attr_current_option = reading.mode if reading is not None else None
+        return self._attr_current_option
+
+    @override
+    async def async_select_option(self, option: str) -> None:
+        """Command it; return when the box follows."""
+        with translated_errors(self.unit.name, self.coordinator.port):
+            await self.charger.command(Command.SET_MODE, Mode(option))
+
+
+class ModeAtStartSelect(SettingEntity, SelectEntity):
+    """The mode in which a box starts; kept in its own memory."""
+
+    def __init__(
+        self,
+        coordinator: BusCoordinator,
+        unit: ChargerUnit,
+        description: SelectEntityDescription,
+    ) -> None:
+        """Belong to the charger."""
+        super().__init__(coordinator, unit, description, Setting.MODE_AT_START)
+
+    @override
+    def show(self) -> Hashable:
+        """Show what the box told."""
+        told = self.told
+        if told is None or told not in range(len(MODES)):
+            self._attr_current_option = None
+        else:
+            self._attr_current_option = MODES[told]
+        return told
+
+    @override
+    async def async_select_option(self, option: str) -> None:
+        """Write it into the box; return when it is read back."""
+        with translated_errors(self.unit.name, self.coordinator.port):
+            await self.charger.configure(self.setting, MODES.index(Mode(option)))
