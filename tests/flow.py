@@ -181,8 +181,11 @@ class Flow:
             self._text(self.texts["progress"][result["progress_action"]], given)
         elif kind is FlowResultType.MENU:
             texts = self._step_texts(given)
+            described = texts.get("menu_option_descriptions", {})
             for option in result["menu_options"]:
                 self._text(texts["menu_options"][option], given)
+                if option in described:
+                    self._text(described[option], given)
         elif kind is FlowResultType.FORM:
             texts = self._step_texts(given)
             for error in (result["errors"] or {}).values():
@@ -248,6 +251,19 @@ async def port_step(
     assert flow.step == "user"
     await flow.submit({"protocol": protocol})
     assert flow.step == "port"
+    return await flow.submit({"device": device, "line": line})
+
+
+async def smartevse_step(
+    hass: HomeAssistant, mode: str, device: str, **line: object
+) -> Flow:
+    flow = await Flow.add_bus(hass)
+    await flow.submit({"protocol": "smartevse"})
+    assert flow.step == "mode"
+    assert flow.result["menu_options"] == ["polled", "master"]
+    await flow.choose(mode)
+    assert flow.step == "port"
+    assert flow.tells("9600 8N1")
     return await flow.submit({"device": device, "line": line})
 
 

@@ -113,8 +113,9 @@ ADDRESSES: Final[Mapping[str, AddressForm]] = {
         many="units",
         error="bad_unit",
         lowest=0,
-        highest=8,
+        highest=1,
         alone=True,
+        labels="unit",
     ),
     "smartevse_master": AddressForm(
         one="slave",

@@ -25,6 +25,7 @@ from .evse.errors import (
 )
 from .evse.line import Line
 from .evse.model import ChargerConfig, CurrentLimit, Orders, ScanReport
+from .flow_address import ADDRESSES
 from .flow_schema import CONF_SEARCH_CURRENT
 
 if TYPE_CHECKING:
@@ -102,7 +103,8 @@ def imposed(
 
 def nothing_imposed(protocol: Protocol) -> list[Imposed]:
     """Return what the search of a protocol that only reads is called with."""
-    return [(_config(protocol, 0, {}), Orders(limit=CurrentLimit(current=0.0)))]
+    config = _config(protocol, ADDRESSES[protocol.key].lowest, {})
+    return [(config, Orders(limit=CurrentLimit(current=0.0)))]
 
 
 def _config(protocol: Protocol, address: int, more: Mapping[str, Any]) -> ChargerConfig:
