@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 # Later than the answer's silence, or it would never be the turn-round that counts.
 EPSILON = 0.0001
+# How differently boxes notice a silence.
+SPREAD = 0.004
 
 
 class SmartEvse(Device):
@@ -52,7 +54,7 @@ class SmartEvse(Device):
         override_works: bool = True,
         settings: dict[str, int] | None = None,
         turn_round: float = 0.01,
-        jitter: float = 0.02,
+        jitter: float = 0.06,
         name: str = "",
     ) -> None:
         """Make a box that is switched on when the bus starts."""
@@ -217,12 +219,15 @@ class SmartEvse(Device):
         self._speak()
 
     def _speak(self) -> None:
-        sending = self.controller.sending
-        while sending:
+        bus, sending = self.bus, self.controller.sending
+        while sending and bus is not None:
             data = sending.pop(0)
-            wait = self.bus.rng.random() * self.jitter if self.bus is not None else 0.0
+            # Boxes are not in step with each other, although our ticks are; those that
+            # wait for the same silence do not notice it at the same moment.
+            wait = bus.rng.random() * self.jitter if data[0] == self.unit else 0.0
+            silence = ANSWER_SILENCE + EPSILON + bus.rng.random() * SPREAD
             self.unasked += 1
-            self.send(data, wait, ANSWER_SILENCE + EPSILON)
+            self.send(data, wait, silence)
 
     def hear(self, segment: Segment) -> None:
         """Hear bytes: more than 3 ms of silence end a frame."""
