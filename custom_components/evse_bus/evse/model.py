@@ -65,6 +65,13 @@ class Fault(StrEnum):
     """Its master had no current for it: it waits for a minute."""
     RCD = "rcd"
     NO_SUN = "no_sun"
+    # Told by a P-CHARGE EWS-Box (manual, 3.2.4: status byte and last result of rc).
+    SOCKET_UNLOCK = "socket_unlock"
+    """The plug cannot be unlocked."""
+    CONFIGURATION = "configuration"
+    CARD_READER = "card_reader"
+    CABLE_LOST = "cable_lost"
+    """The contact of the cable was lost while charging."""
     # Noticed by us.
     UNSUPPORTED_FIRMWARE = "unsupported_firmware"
     SECOND_MASTER = "second_master"

@@ -1,0 +1,148 @@
+"""RFID cards: the box's own list (``rf``, ``sf``) and accepting one (``ma``).
+
+Source: manual, 3.2.4 (``sf``, ``ma``) and 3.1.6. The two contradict each other: 3.1.6
+has 1 for a single card and 2 for a group, ``sf`` has them the other way round and
+leaves out 3, a blocked card. The command reference is taken, and 3 from 3.1.6.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Final
+
+from ..errors import RefusedOrderError
+from .fields import Number, Raw, Text
+from .frames import CommandId, Request
+from .structs import Struct, many, part
+
+ENTRIES: Final = 64
+LARGEST: Final = 0x3FFF
+"""Largest number of a group, and of a card within it: 14 bits."""
+_GROUP_SHIFT: Final = 14
+_KIND_SHIFT: Final = 28
+TAG_LENGTH: Final = 7
+
+
+class EntryKind(IntEnum):
+    """What an entry of the list says, by ``sf``."""
+
+    FREE = 0
+    GROUP = 1
+    """All cards of the group may charge."""
+    CARD = 2
+    """This card may charge."""
+    BLOCKED = 3
+    """This card may not, whatever its group may (3.1.6)."""
+
+
+@dataclass(frozen=True, slots=True)
+class CardEntry:
+    """One entry of the list, as the 32 bits that it is."""
+
+    raw: int = field(repr=False)
+
+    @property
+    def kind_code(self) -> int:
+        """Return the upper four bits."""
+        return self.raw >> _KIND_SHIFT
+
+    @property
+    def kind(self) -> EntryKind | None:
+        """Return what it says; ``None``: a kind that is not in the manual."""
+        return EntryKind(self.kind_code) if self.kind_code in EntryKind else None
+
+    @property
+    def group(self) -> int:
+        """Return the number of the group."""
+        return self.raw >> _GROUP_SHIFT & LARGEST
+
+    @property
+    def card(self) -> int:
+        """Return the number of the card within its group."""
+        return self.raw & LARGEST
+
+
+def card_entry(kind: EntryKind, group: int = 0, card: int = 0) -> CardEntry:
+    """Return an entry for the list; RefusedOrderError for what does not fit.
+
+    0 is no number of a group or card (3.1.6); a whole group has no card.
+    """
+    numbered = kind is not EntryKind.FREE
+    single = kind in (EntryKind.CARD, EntryKind.BLOCKED)
+    if group not in (range(1, LARGEST + 1) if numbered else range(1)):
+        message = f"a group is 1 to {LARGEST}, and 0 in a free entry"
+        raise RefusedOrderError(message)
+    if card not in (range(1, LARGEST + 1) if single else range(1)):
+        message = f"a card is 1 to {LARGEST}, and 0 where none is meant"
+        raise RefusedOrderError(message)
+    return CardEntry(kind << _KIND_SHIFT | group << _GROUP_SHIFT | card)
+
+
+@dataclass(frozen=True, slots=True)
+class CardList:
+    """The list, all of it: it is read and written at once."""
+
+    entries: tuple[CardEntry, ...] = field(repr=False)
+
+    def with_entries(self, changes: Mapping[int, CardEntry]) -> CardList:
+        """Return the list with some entries (0 to 63) replaced, and nothing else.
+
+        Raises RefusedOrderError for an entry that there is not.
+        """
+        if not changes.keys() <= set(range(len(self.entries))):
+            message = f"the list has entries 0 to {len(self.entries) - 1}"
+            raise RefusedOrderError(message)
+        return CardList(
+            tuple(changes.get(at, entry) for at, entry in enumerate(self.entries))
+        )
+
+
+_ENTRY: Final = Struct(CardEntry, "3.2.4 sf: entry", (Number(name="raw", width=4),))
+CARD_LIST: Final = Struct(
+    CardList, "3.2.4 sf", (many(part("entries", _ENTRY), ENTRIES),)
+)
+
+
+def decode_cards(data: bytes) -> CardList:
+    """Return what the answer to ``rf`` says; raises ImplausibleReplyError."""
+    return CARD_LIST.decode(data)
+
+
+def write_cards(cards: CardList) -> Request:
+    """Return the command that writes the list (``sf``)."""
+    return Request(CommandId.WRITE_CARDS, CARD_LIST.encode(cards))
+
+
+# -- ma: accepting a card that the box itself does not know ------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AcceptedCard:
+    """Whom the server accepts for the next start."""
+
+    group: int = field(repr=False)
+    number: int = field(repr=False)
+    user: str = field(default="", repr=False)
+    tag: bytes | None = field(default=None, repr=False)
+    """7 bytes, for the box's history."""
+
+
+ACCEPTED_CARD: Final = Struct(
+    AcceptedCard,
+    "3.2.4 ma",
+    (
+        Number(name="group", width=2, valid=range(LARGEST + 1)),
+        Number(name="number", width=2, valid=range(LARGEST + 1)),
+        Text(name="user", width=8),
+    ),
+)
+_TAG: Final = Raw(name="tag", width=TAG_LENGTH)
+
+
+def accept_card(card: AcceptedCard) -> Request:
+    """Return the command that accepts a card (``ma``).
+
+    Raises RefusedOrderError for numbers and texts that do not fit.
+    """
+    tag = b"" if card.tag is None else _TAG.encode(card.tag)
+    return Request(CommandId.ACCEPT_CARD, ACCEPTED_CARD.encode(card) + tag)

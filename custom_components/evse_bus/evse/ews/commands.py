@@ -1,0 +1,278 @@
+"""What an EWS-Box is told: one function a command, each returns a `Request`.
+
+Source: manual, 3.2.4. Values come from people and programs: what does not fit is
+refused, never cut or wrapped. Cards and parameters have modules of their own.
+"""
+
+from dataclasses import dataclass
+from datetime import datetime
+from enum import IntEnum
+from typing import Final
+
+from ..errors import RefusedOrderError
+from ..safety import Setpoint
+from .fields import Moment, Number
+from .frames import MAXIMUM_PARAMETERS, CommandId, Request
+from .states import StartStop, check_order
+from .status import PortStatus
+from .structs import Struct, many, part
+
+PORTS: Final = (1, 2)
+"""Numbers of the ports; the manual calls them cars."""
+CONFIRMED: Final = frozenset(
+    {
+        CommandId.SET_METER,
+        CommandId.ACTIVATE_FIRMWARE,
+        CommandId.ACCEPT_CARD,
+        CommandId.ERASE_ROM,
+        CommandId.WRITE_ROM,
+        CommandId.SET_CLOCK,
+        CommandId.SET_LEDS,
+        CommandId.WRITE_CARDS,
+        CommandId.WRITE_INSTALLATION,
+        CommandId.START_STOP,
+        CommandId.WRITE_SYSTEM,
+        CommandId.SET_LIMIT,
+        CommandId.WRITE_USER,
+        CommandId.WRITE_EXTRA,
+    }
+)
+"""Commands that are answered with one byte (`answers.confirmed`)."""
+READS: Final = frozenset(
+    {
+        CommandId.READ_FIRMWARE_ID,
+        CommandId.READ_PORTS,
+        CommandId.READ_DETAILS,
+        CommandId.READ_CARDS,
+        CommandId.READ_DHCP,
+        CommandId.READ_INSTALLATION,
+        CommandId.READ_SYSTEM,
+        CommandId.READ_BOX,
+        CommandId.READ_USER,
+        CommandId.READ_EXTRA,
+    }
+)
+
+_PORT: Final = Number(name="port", width=1, valid=PORTS)
+
+
+def read(command: CommandId) -> Request:
+    """Return a command that asks, and changes nothing; RefusedOrderError for others."""
+    if command not in READS:
+        message = f"{command} does not only read"
+        raise RefusedOrderError(message)
+    return Request(command)
+
+
+def reset() -> Request:
+    """Return the command that restarts the box, once its answer has left (``zz``)."""
+    return Request(CommandId.RESET)
+
+
+# -- sl: start and stop; st: the limit ---------------------------------------------
+
+
+def start_stop(
+    port: int, order: StartStop, seen: PortStatus, *, paused: bool = False
+) -> Request:
+    """Return an order to a port (``sl``), for the state it has just been seen in.
+
+    The same order does other things in other states: ``seen`` is from an ``rc`` in
+    the same turn of the bus. ``paused``: we have paused this charge, and nobody has
+    ended it since. Raises NotAvailableError where the order may not be sent.
+    """
+    check_order(order, seen.status, paused=paused)
+    return Request(CommandId.START_STOP, _PORT.encode(port) + bytes((order,)))
+
+
+MINIMUM_LIMIT: Final = 6
+"""A (3.1.8)."""
+_LIMIT: Final = Number(name="limit", width=1, unit="A", valid=range(MINIMUM_LIMIT, 81))
+
+
+def set_limit(port: int, setpoint: Setpoint) -> Request:
+    """Return the limit of a port in whole amperes (``st``).
+
+    0 switches the limit off here, which gives the car all there is: a pause is
+    `StartStop.PAUSE`, and a set-point that is one raises RefusedOrderError, as does
+    one that is not a whole number from 6 A.
+    """
+    current = setpoint.current
+    if not current.is_integer():
+        message = f"a limit of {current} A is not in whole amperes"
+        raise RefusedOrderError(message)
+    if setpoint.paused or current == 0:
+        raise RefusedOrderError("a limit of 0 A would switch the limit off")
+    return Request(
+        CommandId.SET_LIMIT, _PORT.encode(port) + _LIMIT.encode(int(current))
+    )
+
+
+# -- cr, sc: meter and clock -------------------------------------------------------
+
+_TOTAL: Final = Number(name="meter total", width=4, unit="Wh")
+_CLOCK: Final = Moment(name="clock")
+_YEARS: Final = range(2000, 2100)
+
+
+def set_meter(port: int, total: int) -> Request:
+    """Return the command that sets a port's meter total, Wh (``cr``)."""
+    return Request(CommandId.SET_METER, _PORT.encode(port) + _TOTAL.encode(total))
+
+
+def set_clock(clock: datetime) -> Request:
+    """Return the command that sets the clock (``sc``).
+
+    ``clock`` has no zone: it is the time in the zone of the box, as ``rs`` tells it
+    (the manual says so of ``rs`` only). Raises RefusedOrderError otherwise.
+    """
+    if clock.year not in _YEARS:
+        message = f"no clock shows the year {clock.year} today"
+        raise RefusedOrderError(message)
+    return Request(CommandId.SET_CLOCK, _CLOCK.encode(clock))
+
+
+# -- se: LEDs ----------------------------------------------------------------------
+
+_FOREVER: Final = 0xFFFF
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Led:
+    """What one LED is to do."""
+
+    on: int
+    """ms; 0: dark, 65535: lit, or as it was if ``off`` is 65535 too."""
+    off: int
+    """ms"""
+    offset: int = 0
+    """Where in its rhythm it begins, ms."""
+
+
+LED_OFF: Final = Led(on=0, off=0)
+LED_ON: Final = Led(on=_FOREVER, off=0)
+LED_UNCHANGED: Final = Led(on=_FOREVER, off=_FOREVER)
+
+
+def blinking(on: int, off: int, offset: int = 0) -> Led:
+    """Return an LED that is lit and dark for so many ms, again and again.
+
+    Raises RefusedOrderError where it would be always lit, always dark or unchanged.
+    """
+    if on not in range(1, _FOREVER) or off not in range(1, _FOREVER + 1):
+        message = f"{on} ms on and {off} ms off is no blinking"
+        raise RefusedOrderError(message)
+    return Led(on=on, off=off, offset=offset)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PortLeds:
+    """The four LEDs of a port."""
+
+    red: Led = LED_UNCHANGED
+    green: Led = LED_UNCHANGED
+    orange: Led = LED_UNCHANGED
+    spare: Led = LED_UNCHANGED
+
+
+@dataclass(frozen=True, slots=True)
+class Leds:
+    """The LEDs of port 1 and port 2."""
+
+    ports: tuple[PortLeds, PortLeds]
+
+
+_LED: Final = Struct(
+    Led,
+    "3.2.4 se: LED",
+    (
+        Number(name="on", width=2, unit="ms"),
+        Number(name="off", width=2, unit="ms"),
+        Number(name="offset", width=2, unit="ms"),
+    ),
+)
+_PORT_LEDS: Final = Struct(
+    PortLeds,
+    "3.2.4 se: port",
+    (
+        part("red", _LED),
+        part("green", _LED),
+        part("orange", _LED),
+        part("spare", _LED),
+    ),
+)
+LEDS: Final = Struct(Leds, "3.2.4 se", (many(part("ports", _PORT_LEDS)),))
+
+
+def set_leds(first: PortLeds, second: PortLeds) -> Request:
+    """Return the command that sets LEDs by hand (``se``); times in ms.
+
+    Only a box whose keys and LEDs are set to manual takes it. Raises
+    RefusedOrderError for times that do not fit.
+    """
+    return Request(CommandId.SET_LEDS, LEDS.encode(Leds((first, second))))
+
+
+# -- mc: the card reader -----------------------------------------------------------
+
+
+class ReaderTarget(IntEnum):
+    """Who is spoken to behind the box."""
+
+    READER = 1
+    CARD = 2
+
+
+_READER_HEAD: Final = 4
+"""Bytes of parameters before the data: name, target, time-out."""
+_TIMEOUT: Final = Number(name="time-out", width=1, unit="s")
+
+
+def card_reader(target: ReaderTarget, timeout: int, data: bytes) -> Request:
+    """Return a command for the card reader, handed on as it is (``mc``).
+
+    ``timeout``: of the reader, s. Raises RefusedOrderError for what does not fit.
+    """
+    if len(data) > MAXIMUM_PARAMETERS - _READER_HEAD:
+        message = f"{len(data)} bytes for the card reader do not fit"
+        raise RefusedOrderError(message)
+    return Request(
+        CommandId.CARD_READER, bytes((target,)) + _TIMEOUT.encode(timeout) + data
+    )
+
+
+# -- oe, ow, fw: firmware ----------------------------------------------------------
+#
+# How these make an update is not in the manual (3.2.4.1 is empty): a box can be
+# bricked with them.
+
+MAXIMUM_ROM_BYTES: Final = 1024
+"""Bytes that one ``ow`` writes at most."""
+_ROM_ADDRESS: Final = Number(name="address", width=4)
+_ROM_COUNT: Final = Number(name="count", width=4, unit="bytes")
+
+
+def erase_rom(start: int, count: int) -> Request:
+    """Return the command that erases so many bytes of the temporary memory (``oe``)."""
+    return Request(
+        CommandId.ERASE_ROM, _ROM_ADDRESS.encode(start) + _ROM_COUNT.encode(count)
+    )
+
+
+def write_rom(start: int, data: bytes) -> Request:
+    """Return the command that writes to the temporary memory (``ow``).
+
+    Raises RefusedOrderError for nothing and for more than 1024 bytes.
+    """
+    if not 0 < len(data) <= MAXIMUM_ROM_BYTES:
+        message = f"{len(data)} bytes, not 1 to {MAXIMUM_ROM_BYTES}"
+        raise RefusedOrderError(message)
+    return Request(
+        CommandId.WRITE_ROM,
+        _ROM_ADDRESS.encode(start) + _ROM_COUNT.encode(len(data)) + data,
+    )
+
+
+def activate_firmware() -> Request:
+    """Return the command that installs what stands in the memory (``fw``)."""
+    return Request(CommandId.ACTIVATE_FIRMWARE)

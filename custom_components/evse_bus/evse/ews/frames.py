@@ -1,0 +1,323 @@
+"""Messages of MCS binary, the protocol of the EWS-Box. Pure functions.
+
+A message is ``STX length message-id parameters BCC``; the length, 16 bits big-endian,
+counts the parameters alone. The parameters of a command, of its answer and of an info
+record begin with two letters that name it (manual, 3.2.2, 3.2.3).
+"""
+
+from dataclasses import dataclass, field
+from enum import Enum, IntEnum, StrEnum
+from functools import reduce
+from operator import xor
+from typing import Final, override
+
+from ..errors import RefusedOrderError
+from ..framing import Frame, Framer
+
+STX: Final = 0x02
+STX_BYTE: Final = b"\x02"
+MAXIMUM_PARAMETERS: Final = 1040
+"""Bytes of parameters that a message has at most (3.2.2)."""
+_EXTRA: Final = 5
+"""Bytes of a message beside its parameters: STX, length, message-id, BCC."""
+LONGEST_FRAME: Final = MAXIMUM_PARAMETERS + _EXTRA
+_HEAD: Final = 6
+"""Bytes up to the end of the two letters."""
+_LETTERS: Final = frozenset(b"abcdefghijklmnopqrstuvwxyz")
+
+
+class Bcc(Enum):
+    """What the checksum covers; the manual can be read both ways.
+
+    3.2.2: "length + payload", and its table calls the parameters payload; 3.2.3
+    counts the message-id as payload too. A message cannot check by both.
+    """
+
+    ALL = "all"
+    """Everything between STX and BCC."""
+    WITHOUT_MESSAGE_ID = "without_message_id"
+
+
+class MessageId(IntEnum):
+    """What a message is (3.2.2)."""
+
+    ANSWER = ord("A")
+    COMMAND = ord("C")
+    DEBUG = ord("D")
+    INFO = ord("I")
+
+
+_APPLICATION: Final = 0x80
+"""Message-ids from here on are an application's own."""
+_NAMED: Final = (MessageId.ANSWER, MessageId.COMMAND, MessageId.INFO)
+
+
+class CommandId(StrEnum):
+    """The commands of the manual's reference (3.2.4)."""
+
+    SET_METER = "cr"
+    ACTIVATE_FIRMWARE = "fw"
+    READ_FIRMWARE_ID = "id"
+    ACCEPT_CARD = "ma"
+    CARD_READER = "mc"
+    ERASE_ROM = "oe"
+    WRITE_ROM = "ow"
+    READ_PORTS = "rc"
+    READ_DETAILS = "rd"
+    READ_CARDS = "rf"
+    READ_DHCP = "rg"
+    READ_INSTALLATION = "ri"
+    READ_SYSTEM = "rp"
+    READ_BOX = "rs"
+    READ_USER = "ru"
+    READ_EXTRA = "rz"
+    SET_CLOCK = "sc"
+    SET_LEDS = "se"
+    WRITE_CARDS = "sf"
+    WRITE_INSTALLATION = "si"
+    START_STOP = "sl"
+    WRITE_SYSTEM = "sp"
+    SET_LIMIT = "st"
+    WRITE_USER = "su"
+    WRITE_EXTRA = "sz"
+    RESET = "zz"
+
+
+PRIVATE: Final = frozenset(
+    {
+        CommandId.ACCEPT_CARD,
+        CommandId.CARD_READER,
+        CommandId.READ_PORTS,
+        CommandId.READ_DETAILS,
+        CommandId.READ_CARDS,
+        CommandId.READ_INSTALLATION,
+        CommandId.READ_SYSTEM,
+        CommandId.READ_BOX,
+        CommandId.READ_USER,
+        CommandId.WRITE_CARDS,
+        CommandId.WRITE_INSTALLATION,
+        CommandId.WRITE_SYSTEM,
+        CommandId.WRITE_USER,
+    }
+)
+"""Commands with names, cards, passwords or network settings in them or in their
+answers: those bytes belong in no log."""
+_PRIVATE_NAMES: Final = frozenset(command.encode() for command in PRIVATE)
+
+
+def checksum(content: bytes, bcc: Bcc) -> int:
+    """Return the BCC over what stands between STX and BCC."""
+    if bcc is Bcc.WITHOUT_MESSAGE_ID:
+        content = content[:2] + content[3:]
+    return reduce(xor, content, 0)
+
+
+def encode(message_id: int, parameters: bytes, bcc: Bcc) -> bytes:
+    """Return a whole message; RefusedOrderError for too many parameters."""
+    if len(parameters) > MAXIMUM_PARAMETERS:
+        message = f"{len(parameters)} bytes of parameters, not {MAXIMUM_PARAMETERS}"
+        raise RefusedOrderError(message)
+    content = len(parameters).to_bytes(2) + bytes((message_id,)) + parameters
+    return bytes((STX, *content, checksum(content, bcc)))
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """A command, ready to be sent under either reading of the checksum."""
+
+    command: CommandId
+    parameters: bytes = field(default=b"", repr=False)
+
+    def encode(self, bcc: Bcc) -> bytes:
+        """Return the bytes for the wire."""
+        return encode(
+            MessageId.COMMAND, self.command.encode("ascii") + self.parameters, bcc
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class EwsFrame(Frame):
+    """A message with a good checksum: a command, an answer or an info record."""
+
+    raw: bytes = field(repr=False)
+    message_id: MessageId
+    name: str
+    """The two letters that its parameters begin with."""
+    data: bytes = field(repr=False)
+    """What follows them."""
+    bcc: Bcc
+    """The reading by which its checksum is right."""
+
+    def answers(self, command: CommandId) -> bool:
+        """Return whether this is an answer to this command."""
+        return self.message_id is MessageId.ANSWER and self.name == command
+
+
+def redacted(raw: bytes) -> bytes:
+    """Return bytes as they may stand in a log: what may be private is zero.
+
+    Of a message that is known and not private, everything is kept; of a private one
+    the head with its name; of anything else only the number of bytes.
+    """
+    if _whole(raw, 0) != raw or raw[3] not in _NAMED:
+        return bytes(len(raw))
+    head = raw[:_HEAD]
+    return head + bytes(len(raw) - _HEAD) if head[4:] in _PRIVATE_NAMES else raw
+
+
+# -- Finding messages --------------------------------------------------------------
+
+_INFO_HEAD: Final = b"\x02\x00\x0bIif"
+_INFO_LENGTH: Final = 16
+"""Bytes of the one info record there is (3.2.3), which may come at any moment."""
+_SURE: Final = 4
+"""So many bytes of its head do not stand in another message by chance."""
+
+
+class EwsFramer(Framer[EwsFrame]):
+    """Finds messages by their head, length and checksum.
+
+    A message begun is waited for, but not at the cost of others: an info record that
+    is found inside is taken out of it, and an answer or a command that is found
+    inside shows that the one begun will never end. Debug messages and those of other
+    applications are skipped whole.
+    """
+
+    def __init__(self) -> None:
+        """Start with nothing heard."""
+        super().__init__()
+        self._buffer = b""
+        self.skipped = 0
+        """Good messages that concern nobody here: debug, other applications."""
+
+    @property
+    @override
+    def pending(self) -> int:
+        return len(self._buffer)
+
+    @override
+    def reset(self) -> None:
+        self.noise += len(self._buffer)
+        self._buffer = b""
+
+    @override
+    def feed(self, data: bytes) -> list[EwsFrame]:
+        buffer = self._buffer + data
+        found: list[EwsFrame] = []
+        taken = at = 0
+        begun: int | None = None
+        while (at := buffer.find(STX_BYTE, at)) >= 0:
+            whole = _whole(buffer, at)
+            if whole is None:
+                if begun is None:
+                    if _may_end(buffer, at):
+                        begun = at
+                    else:
+                        self.bad += _length(buffer[at : at + _HEAD]) is not None
+                at += 1
+                continue
+            frame = _frame(whole)
+            if begun is not None:
+                if frame is None or frame.name not in _TRUSTED_INSIDE:
+                    at += 1
+                    continue
+                if frame.message_id is MessageId.INFO:
+                    found.append(frame)
+                    buffer = buffer[:at] + buffer[at + len(whole) :]
+                    at, begun = begun, None
+                    continue
+                self.bad += 1
+                begun = None
+            if frame is None:
+                self.skipped += 1
+            else:
+                found.append(frame)
+            self.noise += at - taken
+            taken = at = at + len(whole)
+        kept = len(buffer) if begun is None else begun
+        self.noise += kept - taken
+        self._buffer = buffer[kept:]
+        return found
+
+
+_TRUSTED_INSIDE: Final = frozenset({"if", *CommandId})
+"""Names that are believed where they might be the contents of another message."""
+
+
+def _length(head: bytes) -> int | None:
+    """Return how long a message is that begins so; ``None``: none does.
+
+    While its head has not come whole, a length that its bytes do not reach either.
+    """
+    if len(head) < 4:
+        return _HEAD
+    message_id = head[3]
+    if message_id in _NAMED:
+        if head[1:3] < b"\0\2" or not _LETTERS.issuperset(head[4:]):
+            return None
+        if len(head) < _HEAD:
+            return _HEAD
+    elif message_id != MessageId.DEBUG and message_id < _APPLICATION:
+        return None
+    return int.from_bytes(head[1:3]) + _EXTRA
+
+
+def _whole(buffer: bytes, at: int) -> bytes | None:
+    """Return the good message that begins here, if it has come to its end."""
+    length = _length(buffer[at : at + _HEAD])
+    if length is None or length > min(LONGEST_FRAME, len(buffer) - at):
+        return None
+    raw = buffer[at : at + length]
+    # With a record in its middle, its checksum is right by chance only.
+    if _reading(raw) is None or _record_inside(buffer, at, at + length, _SURE):
+        return None
+    return raw
+
+
+def _reading(raw: bytes) -> Bcc | None:
+    """Return the reading by which the checksum of a message is right."""
+    content = raw[1:-1]
+    for bcc in Bcc:
+        if checksum(content, bcc) == raw[-1]:
+            return bcc
+    return None
+
+
+def _frame(raw: bytes) -> EwsFrame | None:
+    """Return a good message as a frame; ``None``: one to skip."""
+    bcc = _reading(raw)
+    if raw[3] not in _NAMED or bcc is None:
+        return None
+    return EwsFrame(
+        raw=raw,
+        message_id=MessageId(raw[3]),
+        name=raw[4:_HEAD].decode("ascii"),
+        data=raw[_HEAD:-1],
+        bcc=bcc,
+    )
+
+
+def _may_end(buffer: bytes, at: int) -> bool:
+    """Return whether what begins here may become a good message."""
+    length = _length(buffer[at : at + _HEAD])
+    if length is not None and len(buffer) - at < length <= LONGEST_FRAME:
+        return True
+    # It looks broken: it may be whole but for an info record in its middle.
+    end = at + (_HEAD if length is None else min(length, LONGEST_FRAME))
+    return _record_inside(buffer, at, end, 1)
+
+
+def _record_inside(buffer: bytes, at: int, end: int, least: int) -> bool:
+    """Return whether an info record begins inside a message, and is not broken.
+
+    ``least``: so many of its bytes must have come.
+    """
+    while (at := buffer.find(STX_BYTE, at + 1, end)) >= 0:
+        record = buffer[at : at + _INFO_LENGTH]
+        if (
+            len(record) >= least
+            and _INFO_HEAD.startswith(record[:_HEAD])
+            and (len(record) < _INFO_LENGTH or _reading(record) is not None)
+        ):
+            return True
+    return False

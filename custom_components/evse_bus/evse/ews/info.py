@@ -1,0 +1,84 @@
+"""The record that an EWS-Box sends unasked: ``I`` with ``if``.
+
+Source: manual, 3.2.3. It may come at any moment, also between a command and its
+answer, and is a reason to poll at once.
+"""
+
+from dataclasses import dataclass
+from enum import KEEP, IntFlag
+from typing import Final
+
+from .fields import Bits, Number
+from .frames import EwsFrame, MessageId
+from .structs import Struct, many
+
+_NAME: Final = "if"
+KEYS: Final = 4
+"""Keys of a port."""
+_PRESSED: Final = 255
+_STEP: Final = 0.1
+"""s"""
+
+
+class Change(IntFlag, boundary=KEEP):
+    """What has changed."""
+
+    CARD = 1 << 0
+    """Another card is at the reader."""
+    PORT_2 = 1 << 1
+    PORT_1 = 1 << 2
+    """Start or stop by key or web page, or charging has ended."""
+
+
+@dataclass(frozen=True, slots=True)
+class KeyEvent:
+    """A key was pressed, or released after a time."""
+
+    port: int
+    """1 or 2."""
+    key: int
+    """1 to 4."""
+    held: float | None
+    """How long it was pressed, s; ``None``: it is pressed now."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Info:
+    """What the record tells."""
+
+    changes: Change
+    keys: tuple[int, ...]
+    """Port 1, key 1 to 4, then port 2: 0 nothing, 255 pressed, else held for 0.1 s."""
+
+    @property
+    def key_events(self) -> tuple[KeyEvent, ...]:
+        """Return what happened to keys; only a box with manual keys tells it."""
+        return tuple(
+            KeyEvent(
+                port=1 + at // KEYS,
+                key=1 + at % KEYS,
+                held=None if code == _PRESSED else round(code * _STEP, 1),
+            )
+            for at, code in enumerate(self.keys)
+            if code
+        )
+
+
+INFO: Final = Struct(
+    Info,
+    "3.2.3 if",
+    (
+        Bits(name="changes", kind=Change),
+        many(Number(name="keys", width=1, unit="0.1 s"), 2 * KEYS),
+    ),
+)
+
+
+def decode_info(frame: EwsFrame) -> Info | None:
+    """Return what an info record tells; ``None``: it is none, or one of another name.
+
+    Raises ImplausibleReplyError for one of another length.
+    """
+    if frame.message_id is not MessageId.INFO or frame.name != _NAME:
+        return None
+    return INFO.decode(frame.data)

@@ -1,0 +1,320 @@
+"""What is set in an EWS-Box: ``rp ru ri rz`` read it, ``sp su si sz`` write it.
+
+A block is changed as it was read: its bytes stay what they are but for the fields
+that are named, whatever the others mean. Source: manual, 3.2.4 (``sp``, ``su``,
+``si``, ``sz``) and the table of 3.1.1.
+
+Two of the blocks begin with a password, which the box may hide when it is read; the
+manual does not say. A block whose password does not stand in it is not written,
+unless the password is named too: it would be erased.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import KEEP, Enum, IntEnum, IntFlag
+from ipaddress import IPv4Address
+from typing import TYPE_CHECKING, Final
+
+from ..errors import RefusedOrderError
+from .fields import Address, Ascii, Bits, Flag, Number, Raw, Text
+from .frames import CommandId, Request
+from .structs import Struct
+
+if TYPE_CHECKING:
+    from .fields import Field
+
+_ANY_BYTE: Final = range(256)
+_LIMIT: Final = (0, *range(6, 81))
+"""A: none, or from the lowest limit (3.1.8) to what a control pilot can offer."""
+
+
+# -- rp, sp: the installation ------------------------------------------------------
+
+
+class SystemMode(IntFlag, boundary=KEEP):
+    """How the box works."""
+
+    SERVER = 1 << 0
+    """A server is asked for each start; else standalone."""
+    CARDS = 1 << 1
+    """Cards are asked for."""
+    RS232 = 1 << 2
+    """The server is on RS-232; else on Ethernet. Not to be changed over Ethernet."""
+    MANUAL_IO = 1 << 3
+    """The server has the keys and LEDs."""
+    EXCLUSIVE = 1 << 4
+    """One port at a time."""
+
+
+class CableMode(IntFlag, boundary=KEEP):
+    """What hangs on the ports."""
+
+    FIXED_CABLE = 1 << 0
+    """The mode 3 cable is a fixed one."""
+    PORT_1_MODE_1 = 1 << 1
+    PORT_2_MODE_1 = 1 << 2
+
+
+class LockType(IntEnum):
+    """How the plug is locked (3.1.1), with the makers the manual names."""
+
+    BALS_MENNEKES = 0
+    WALTHER = 1
+    FCT_HIGH = 2
+    """FCT: locked is high."""
+    FCT_LOW = 3
+    """FCT: locked is low."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SystemParameters:
+    """What ``rp`` tells."""
+
+    admin_password: str = field(repr=False)
+    ports: int
+    mode: SystemMode
+    pulses_per_kwh: int
+    """Of the meter; of port 1's where port 2 has its own."""
+    lock_type: int
+    """See `LockType`; of a plugged cable."""
+    card_pin: str = field(repr=False)
+    """Only cards with this are read."""
+    ventilation: bool
+    """The installation can ventilate."""
+    maximum_current: int
+    """A; 0: what the jumper says. With a fixed cable, the cable's too."""
+    restart_after_power_failure: bool
+    cable_mode: CableMode
+
+    @property
+    def mode_1(self) -> tuple[bool, bool]:
+        """Return which of the two ports are in mode 1."""
+        return (
+            CableMode.PORT_1_MODE_1 in self.cable_mode,
+            CableMode.PORT_2_MODE_1 in self.cable_mode,
+        )
+
+    @property
+    def fixed_cable(self) -> bool:
+        """Return whether the cable of mode 3 is a fixed one."""
+        return CableMode.FIXED_CABLE in self.cable_mode
+
+
+SYSTEM: Final = Struct(
+    SystemParameters,
+    "3.2.4 sp",
+    (
+        Text(name="admin_password", width=12),
+        Number(name="ports", width=1, possible=range(1, 3)),
+        Bits(name="mode", kind=SystemMode),
+        Number(name="pulses_per_kwh", width=4, unit="1/kWh"),
+        Number(name="lock_type", width=1, valid=tuple(LockType)),
+        Ascii(name="card_pin", width=4),
+        Flag(name="ventilation"),
+        Number(name="maximum_current", width=1, unit="A", valid=_LIMIT),
+        Flag(name="restart_after_power_failure"),
+        Bits(name="cable_mode", kind=CableMode),
+    ),
+)
+
+
+# -- ru, su: the network -----------------------------------------------------------
+
+
+class TimeZone(IntEnum):
+    """Zone of the box's clock."""
+
+    GMT = 0
+    CET = 1
+    """"MEZ (Deutschland)"; nothing is said of summer time."""
+
+
+GERMAN: Final = 0
+"""The one language the manual gives a number for."""
+SOURCE_PORTS: Final = 10
+"""The box dials from so many ports, one after the other."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UserParameters:
+    """What ``ru`` tells. Wrong ones cut the box off the network."""
+
+    user_password: str = field(repr=False)
+    address: IPv4Address = field(repr=False)
+    """0.0.0.0: by DHCP, and gateway and netmask are ignored."""
+    source_port: int
+    """First of `SOURCE_PORTS` from which it dials the server."""
+    gateway: IPv4Address = field(repr=False)
+    netmask: IPv4Address = field(repr=False)
+    server: IPv4Address = field(repr=False)
+    server_port: int
+    language: int
+    zone_code: int
+    """See `TimeZone`."""
+
+
+USER: Final = Struct(
+    UserParameters,
+    "3.2.4 su",
+    (
+        Text(name="user_password", width=12),
+        Address(name="address"),
+        Number(name="source_port", width=2, valid=range(0x10001 - SOURCE_PORTS)),
+        Address(name="gateway"),
+        Address(name="netmask"),
+        Address(name="server"),
+        Number(name="server_port", width=2),
+        Number(name="language", width=1, valid=_ANY_BYTE),
+        Number(name="zone_code", width=1, valid=tuple(TimeZone)),
+    ),
+)
+
+
+# -- ri, si: whose it is -----------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InstallationInfo:
+    """What ``ri`` tells: texts about the owner."""
+
+    name: str = field(repr=False)
+    street: str = field(repr=False)
+    town: str = field(repr=False)
+    telephone: str = field(repr=False)
+    customer_number: str = field(repr=False)
+
+
+INSTALLATION: Final = Struct(
+    InstallationInfo,
+    "3.2.4 si",
+    (
+        Text(name="name", width=30),
+        Text(name="street", width=30),
+        Text(name="town", width=30),
+        Text(name="telephone", width=20),
+        Text(name="customer_number", width=20),
+    ),
+)
+
+
+# -- rz, sz: more of the installation ----------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExtraParameters:
+    """What ``rz`` tells."""
+
+    pulses_per_kwh_2: int
+    """Of port 2's meter; 0: as port 1."""
+    maximum_current_2: int
+    """Of port 2, A; 0: as port 1."""
+    voltage_1: int
+    """V. The manual names no unit."""
+    voltage_2: int
+    compatible_1: bool
+    """Cars that have fallen asleep are woken (3.1.1)."""
+    compatible_2: bool
+    reserved: bytes = field(repr=False)
+    """All 0 in the manual; kept as they are."""
+
+
+EXTRA: Final = Struct(
+    ExtraParameters,
+    "3.2.4 sz",
+    (
+        Number(name="pulses_per_kwh_2", width=4, unit="1/kWh"),
+        Number(name="maximum_current_2", width=1, unit="A", valid=_LIMIT),
+        Number(name="voltage_1", width=2, unit="V"),
+        Number(name="voltage_2", width=2, unit="V"),
+        Flag(name="compatible_1"),
+        Flag(name="compatible_2"),
+        Raw(name="reserved", width=53),
+    ),
+)
+
+
+# -- Changing ----------------------------------------------------------------------
+
+
+class PasswordShown(Enum):
+    """What stands where a block has its password."""
+
+    SHOWN = "shown"
+    EMPTY = "empty"
+    """None is set, or the box hides it: nobody can tell."""
+    MASKED = "masked"
+    """One sign over and over, or no readable text."""
+
+
+def password_shown(password: bytes) -> PasswordShown:
+    """Return whether a password was read as it is set (12 bytes)."""
+    text = password.split(b"\0", 1)[0].rstrip(b" ")
+    if not text:
+        return PasswordShown.EMPTY
+    readable = text.isascii() and text.decode("latin-1").isprintable()
+    # Nobody who sets one takes twelve equal signs; a mask does.
+    alike = len(set(text)) == 1
+    return PasswordShown.MASKED if alike or not readable else PasswordShown.SHOWN
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Block[T]:
+    """Parameters that are read and written together."""
+
+    read: CommandId
+    write: CommandId
+    struct: Struct[T]
+    password: str | None = None
+    """Name of the field with the password, always the first one."""
+
+    def decode(self, data: bytes) -> T:
+        """Return what the answer to the read says; raises ImplausibleReplyError."""
+        return self.struct.decode(data)
+
+    def change(self, data: bytes, changes: Mapping[str, object]) -> Request:
+        """Return the command that writes a block just read, with these changes.
+
+        Raises RefusedOrderError for a field or value that cannot be, for nothing to
+        change, and where the password would be erased; ImplausibleReplyError for
+        bytes that are no such block.
+        """
+        if not changes:
+            message = f"{self.struct.source}: nothing to change"
+            raise RefusedOrderError(message)
+        changed = self.struct.changed(data, changes)
+        if self.password is not None and self.password not in changes:
+            self._check_password(self.struct.fields[0], data)
+        return Request(self.write, changed)
+
+    def _check_password(self, known: Field[object], data: bytes) -> None:
+        shown = password_shown(data[: known.width])
+        if shown is not PasswordShown.SHOWN:
+            message = (
+                f"{self.struct.source}: the box tells no {known.name} ({shown.value}); "
+                "writing would erase it unless it is named as well"
+            )
+            raise RefusedOrderError(message)
+
+
+SYSTEM_BLOCK: Final = Block(
+    read=CommandId.READ_SYSTEM,
+    write=CommandId.WRITE_SYSTEM,
+    struct=SYSTEM,
+    password="admin_password",  # noqa: S106 - the name of a field
+)
+"""Not written while the box starts or a car charges; it starts anew afterwards."""
+USER_BLOCK: Final = Block(
+    read=CommandId.READ_USER,
+    write=CommandId.WRITE_USER,
+    struct=USER,
+    password="user_password",  # noqa: S106 - the name of a field
+)
+INSTALLATION_BLOCK: Final = Block(
+    read=CommandId.READ_INSTALLATION,
+    write=CommandId.WRITE_INSTALLATION,
+    struct=INSTALLATION,
+)
+EXTRA_BLOCK: Final = Block(
+    read=CommandId.READ_EXTRA, write=CommandId.WRITE_EXTRA, struct=EXTRA
+)
+BLOCKS: Final = (SYSTEM_BLOCK, USER_BLOCK, INSTALLATION_BLOCK, EXTRA_BLOCK)

@@ -1,0 +1,251 @@
+"""What an EWS-Box tells of its ports: ``rc``, ``rd``.
+
+Source of the tables: manual, 3.2.4, the command of each. Two ports a box; pairs are
+port 1, port 2. Names and cards are private: no repr shows them.
+"""
+
+from dataclasses import dataclass, field
+from datetime import datetime
+from enum import KEEP, IntEnum, IntFlag
+from typing import Final
+
+from .fields import Bits, Centivolts, Field, Flag, Moment, Number, Text, Untold
+from .structs import Struct, many, optional
+
+type Pair[V] = tuple[V, V]
+
+_AMPERES: Final = range(81)
+"""A control pilot offers no more than 80 A (IEC 61851-1, annex A)."""
+_PERCENT: Final = range(101)
+_WATTS: Final = range(100_001)
+"""Twice what three phases of 70 A carry: a meter counted by pulses may jump."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Card:
+    """A card by which somebody has logged in."""
+
+    group: int = field(repr=False)
+    number: int = field(repr=False)
+    """Within its group."""
+    user: str = field(repr=False)
+
+
+CARD_FIELDS: Final = (
+    Number(name="group", width=2),
+    Number(name="number", width=2),
+    Text(name="user", width=8),
+)
+CARD: Final = Struct(Card, "3.2.4 rc: card", CARD_FIELDS)
+
+
+# -- rc: the two ports -------------------------------------------------------------
+
+
+class PortFlags(IntFlag, boundary=KEEP):
+    """What the car has asked for."""
+
+    VENTILATION = 1 << 0
+
+
+class StartRelease(IntEnum):
+    """Whether a start was asked for or allowed."""
+
+    NONE = 0
+    """Not in the manual; what is left beside 1 and 2."""
+    REQUESTED = 1
+    """Somebody wants to charge and waits for the server to allow it."""
+    RELEASED = 2
+
+
+class ChargeResult(IntEnum):
+    """How the last charge ended; valid after its end."""
+
+    STOPPED = 1
+    PILOT_LOST = 3
+    """The cable was pulled at the car: not a fault."""
+    CABLE_LOST = 4
+    RCD = 5
+    METER = 6
+    SERVER_TIMEOUT = 7
+    VENTILATION = 8
+    PILOT_UNSTABLE = 9
+
+
+class KeysAndLeds(IntFlag, boundary=KEEP):
+    """Keys pressed and LEDs lit."""
+
+    KEY_1 = 1 << 0
+    KEY_2 = 1 << 1
+    KEY_3 = 1 << 2
+    KEY_4 = 1 << 3
+    LED_RED = 1 << 4
+    LED_GREEN = 1 << 5
+    LED_ORANGE = 1 << 6
+    LED_SPARE = 1 << 7
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PortStatus:
+    """What ``rc`` tells of one port; ``None``: a mode 1 port does not know it."""
+
+    status: int
+    """Status byte, see `states`."""
+    cable_current: int | None
+    """Rated current of the cable, A; 0: none known."""
+    offered_current: int | None
+    """Highest current that the box offers now, A."""
+    flags: PortFlags
+    start_code: int
+    """See `start`."""
+    optimised: bool
+    """The next start is an optimised one."""
+    result_code: int
+    """See `result`."""
+    session_time: int
+    """Of the charge under way, s."""
+    session_energy: int
+    """Of the charge under way, Wh."""
+    last_time: int
+    """Of the last charge, s."""
+    last_energy: int
+    """Of the last charge, Wh."""
+    total_energy: int
+    """Meter total, Wh; ``cr`` sets it."""
+    meter_cycles: int
+    """"Absolute meter cycle counter"; no unit is named."""
+    locked: bool | None
+    contactor: bool
+    """The contactor is closed."""
+    rcd_tripped: bool
+    pwm_minimum: float | None
+    """Lowest level of the control pilot, V."""
+    pwm_maximum: float | None
+    """Highest level of the control pilot, V."""
+    cable_voltage: float | None
+    """At the proximity contact, V."""
+    keys_and_leds: KeysAndLeds
+    card: Card | None = field(repr=False)
+    """With which somebody has logged in at this port."""
+
+    @property
+    def start(self) -> StartRelease | None:
+        """Return whether a start is asked for; ``None``: a code not in the manual."""
+        known = self.start_code in StartRelease
+        return StartRelease(self.start_code) if known else None
+
+    @property
+    def result(self) -> ChargeResult | None:
+        """Return how the last charge ended; ``None``: never, or not in the manual."""
+        known = self.result_code in ChargeResult
+        return ChargeResult(self.result_code) if known else None
+
+
+_MODE_3_ONLY: Final = frozenset(
+    {
+        "cable_current",
+        "offered_current",
+        "locked",
+        "pwm_minimum",
+        "pwm_maximum",
+        "cable_voltage",
+    }
+)
+
+PORT: Final = Struct(
+    PortStatus,
+    "3.2.4 rc",
+    (
+        Number(name="status", width=1),
+        Number(name="cable_current", width=1, unit="A", possible=_AMPERES),
+        Number(name="offered_current", width=1, unit="A", possible=_AMPERES),
+        Bits(name="flags", kind=PortFlags),
+        Number(name="start_code", width=1),
+        Flag(name="optimised"),
+        Number(name="result_code", width=1),
+        Number(name="session_time", width=4, unit="s"),
+        Number(name="session_energy", width=4, unit="Wh"),
+        Number(name="last_time", width=4, unit="s"),
+        Number(name="last_energy", width=4, unit="Wh"),
+        Number(name="total_energy", width=4, unit="Wh"),
+        Number(name="meter_cycles", width=4),
+        Flag(name="locked"),
+        Flag(name="contactor"),
+        Flag(name="rcd_tripped"),
+        Centivolts(name="pwm_minimum"),
+        Centivolts(name="pwm_maximum"),
+        Centivolts(name="cable_voltage"),
+        Bits(name="keys_and_leds", kind=KeysAndLeds),
+        optional("card", CARD),
+    ),
+)
+
+
+def _mode_1(known: Field[object]) -> Field[object]:
+    if known.name in _MODE_3_ONLY:
+        return Untold(name=known.name, width=known.width)
+    return known
+
+
+PORT_MODE_1: Final = Struct(
+    PortStatus, "3.2.4 rc", tuple(_mode_1(one) for one in PORT.fields)
+)
+"""A port in mode 1 (a household socket): six of the fields mean nothing there."""
+
+LENGTH_PORTS: Final = 2 * PORT.length
+
+
+def decode_ports(data: bytes, mode_1: Pair[bool] = (False, False)) -> Pair[PortStatus]:
+    """Return what the answer to ``rc`` says of port 1 and port 2.
+
+    ``mode_1``: which of them are in mode 1 (`parameters.CableMode`). Raises
+    ImplausibleReplyError.
+    """
+    first, second = (PORT_MODE_1 if one else PORT for one in mode_1)
+    return first.decode(data[: PORT.length]), second.decode(data[PORT.length :])
+
+
+# -- rd: more of the two ports -----------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Details:
+    """What ``rd`` tells of port 1 and port 2."""
+
+    power: Pair[int]
+    """W. The manual calls it energy; its unit is that of power."""
+    pwm_duty: Pair[int]
+    """Duty cycle of the control pilot, %."""
+    pilot_code: Pair[int]
+    """"Low-level PWM state A", raw."""
+    cable_code: Pair[int]
+    """"Low-level cable current detection in A", raw."""
+    limit: Pair[int]
+    """As set with ``st``, A; 0: none. Not checked: what is too high is sent again."""
+    last_card: Pair[Card | None] = field(repr=False)
+    """Who was logged in for the last charge."""
+    last_end: Pair[datetime | None]
+    """When the last charge ended, in the box's time zone."""
+
+
+DETAILS: Final = Struct(
+    Details,
+    "3.2.4 rd",
+    (
+        many(Number(name="power", width=4, unit="W", possible=_WATTS)),
+        many(Number(name="pwm_duty", width=1, unit="%", possible=_PERCENT)),
+        many(Number(name="pilot_code", width=1)),
+        many(Number(name="cable_code", width=1)),
+        many(Number(name="limit", width=1, unit="A")),
+        many(optional("last_card", CARD)),
+        many(Moment(name="last_end")),
+    ),
+)
+
+
+def decode_details(data: bytes) -> Details:
+    """Return what the answer to ``rd`` says; later firmware appends to it.
+
+    Raises ImplausibleReplyError.
+    """
+    return DETAILS.decode(data, longer=True)
