@@ -23,6 +23,12 @@ from .car import Car, CarLife
 from .device import Device
 from .evbox import EvboxChargePoint, Module
 from .evbox_frames import Order, orders_in, rude_requests
+from .ews_box import EwsBox
+from .ews_dialler import EwsDialler
+from .ews_frames import ews_commands_in
+from .ews_port import EwsPort
+from .ews_records import EwsCommand, EwsInfo, EwsLimit, InfoMix
+from .ews_rfid import Card as EwsCard
 from .faults import Faults
 from .log import CLIENT, Entry, TrafficLog
 from .smartevse import SmartEvse
@@ -39,8 +45,16 @@ __all__ = [
     "Device",
     "Entry",
     "EvboxChargePoint",
+    "EwsBox",
+    "EwsCard",
+    "EwsCommand",
+    "EwsDialler",
+    "EwsInfo",
+    "EwsLimit",
+    "EwsPort",
     "Faults",
     "Handshake",
+    "InfoMix",
     "Module",
     "Order",
     "Outlet",
@@ -54,6 +68,7 @@ __all__ = [
     "Write",
     "amps_of",
     "duty_of",
+    "ews_commands_in",
     "orders_in",
     "requests_in",
     "rude_requests",
