@@ -4,14 +4,14 @@ Every turn has one exchange at most, so that a master's broadcast never waits fo
 more. PROTOCOLS.md, 3.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Final, override
 
 from ..errors import GarbledReplyError, NotConfirmedError
 from ..exchange import Request, Talk
-from ..jobs import Later
+from ..jobs import Later, Step
 from ..model import ChargerConfig, Fault, Orders, Range, Setting
 from ..turns import Turns, in_turns
 from .dialects import MAPS
@@ -50,8 +50,10 @@ class SmartEvseBox(SmartEvseReader):
     async def poll(self, talk: Talk) -> Later[None] | None:
         try:
             if self.dialect is None:
-                return await in_turns(self._meet)(talk)
-            await self.look(talk)
+                later = await self.turns(self.reach)(talk)
+            else:
+                await self.look(talk)
+                later = None
         except GarbledReplyError:
             self._garbled += 1
             if self._garbled >= GARBLED:
@@ -59,22 +61,17 @@ class SmartEvseBox(SmartEvseReader):
             raise
         self._garbled = 0
         self.tell(Fault.DUPLICATE_ADDRESS, present=False)
-        return self.what_now(talk.now)
+        return later or self.what_now(talk.now)
 
-    async def _meet(self, talk: Talk) -> Turns:
-        """Learn all about a box that was just found."""
-        async for pause in self.reach(talk):
-            yield pause
-        yield 0.0
-        if not self.busy and self.must_tend(talk.now):
-            async for pause in self._tend(talk):
-                yield pause
+    def turns(self, conversation: Callable[[Talk], Turns]) -> Step[None]:
+        """Return the first turn of a conversation with this box."""
+        return in_turns(conversation)
 
     def what_now(self, now: float) -> Later[None] | None:
         """Return what must be asked or said because of a status."""
         if self.busy or not self.must_tend(now):
             return None
-        return Later(0.0, in_turns(self._tend))
+        return Later(0.0, self.turns(self._tend))
 
     async def _tend(self, talk: Talk) -> Turns:
         token = self.begin()
@@ -113,7 +110,7 @@ class SmartEvseBox(SmartEvseReader):
     @override
     async def configure(self, setting: Setting, value: int) -> None:
         conversation = self._set_up.conversation(setting, value)
-        await self.run(in_turns(conversation))
+        await self.run(self.turns(conversation))
 
     # -- Access ----------------------------------------------------------------------
 
@@ -138,6 +135,7 @@ class SmartEvseBox(SmartEvseReader):
                     yield wait
                 if self._has_access(allowed):
                     return
+            yield 0.0
         what = "on" if allowed else "off"
         message = f"{self.config.name} does not turn its access {what}"
         raise NotConfirmedError(message)

@@ -139,6 +139,7 @@ class SmartEvseReader(Charger):
         if self.status is None:
             async for pause in self.see(talk):
                 yield pause
+            yield 0.0
 
     async def _find_dialect(self, talk: Talk) -> Turns:
         found = smartevse_config(self.config).dialect
@@ -267,7 +268,9 @@ class SmartEvseReader(Charger):
                 yield 0.0
             configuration = decode_configuration(dialect, told)
         except ImplausibleReplyError, ReplyTimeoutError, ExchangeRefusedError:
-            self.configuration_due = talk.now + CONFIGURATION_RETRY
+            # Before they are known the limit is 6 A: then each poll tries again.
+            pause = CONFIGURATION_RETRY if self.configuration is not None else 0.0
+            self.configuration_due = talk.now + pause
             return
         self.configuration = configuration
         self.configuration_due = talk.now + CONFIGURATION_INTERVAL

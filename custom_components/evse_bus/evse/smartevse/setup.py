@@ -54,12 +54,7 @@ class SetUp:
         box = self._box
         token = box.begin()
         try:
-            async for pause in box.reach(talk):
-                yield pause
-            async for pause in box.see(talk):
-                yield pause
-            yield 0.0
-            async for pause in box.read_configuration(talk):
+            async for pause in self._look(talk):
                 yield pause
             if self._is_set(setting, value):
                 # What is set already is not written: the memory wears out.
@@ -70,15 +65,33 @@ class SetUp:
             if not had_access:
                 async for pause in self._close(talk):
                     yield pause
-            yield 0.0
-            box.configuration = None
-            async for pause in box.read_configuration(talk):
+            async for pause in self._read_back(talk):
                 yield pause
         finally:
             box.end(token)
         if not self._is_set(setting, value):
             message = f"{box.config.name} did not take {setting} = {value}"
             raise NotConfirmedError(message)
+
+    async def _look(self, talk: Talk) -> Turns:
+        """Read access and settings as they are now."""
+        box = self._box
+        async for pause in box.reach(talk):
+            yield pause
+        async for pause in box.see(talk):
+            yield pause
+        yield 0.0
+        async for pause in box.read_configuration(talk):
+            yield pause
+
+    async def _read_back(self, talk: Talk) -> Turns:
+        box = self._box
+        box.configuration = None
+        async for pause in box.read_configuration(talk):
+            yield pause
+        if box.configuration is None:
+            # Nobody knows what it may offer now: to be read as soon as it can be.
+            box.configuration_due = 0.0
 
     def _is_set(self, setting: Setting, value: int) -> bool:
         configuration = self._box.configuration
@@ -101,11 +114,12 @@ class SetUp:
         try:
             async for pause in box.see(talk):
                 yield pause
+            yield 0.0
             if box.status is not None and not box.status.access:
                 return
-            yield 0.0
             async for pause in box.set_access(talk, allowed=False):
                 yield pause
+            yield 0.0
         except EvseError as error:
             message = (
                 f"{box.config.name}: access was off before the setting was written, "

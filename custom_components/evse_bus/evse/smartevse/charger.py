@@ -1,0 +1,410 @@
+"""One SmartEVSE that is polled: without load balancing, or its own master.
+
+It is read first, always. Its limit is an override of the box's own maximum: forgotten
+in a power failure, taken off by a 0, and in force only while a car charges. So it is
+written ahead for the car that comes, read back while it charges, and asserted downward
+whenever it is read back above the order. 0 A is never written: a pause is access off.
+PROTOCOLS.md, 3.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import ClassVar, Final, override
+
+from ..errors import (
+    DuplicateAddressError,
+    NotConfirmedError,
+    RefusedOrderError,
+)
+from ..exchange import Request, Talk
+from ..jobs import Later, Step
+from ..model import (
+    MINIMUM_CURRENT,
+    ChargerConfig,
+    Command,
+    CurrentLimit,
+    Fault,
+    OrderChange,
+    Orders,
+    Persistence,
+)
+from ..safety import Setpoint, clamp
+from ..schedule import Kind
+from ..turns import Turns, in_turns
+from .box import WRITES, SmartEvseBox
+from .config import PolledConfig, polled_config
+from .dialects import MAPS, Dialect
+from .mode import mode_conversation
+from .registers import Status, tenths, write_current
+from .states import CHARGING, is_stopped, offered, state_of, tells_plug
+from .timing import LOOK_AGAIN, QUIET, SETTLING
+
+COMMANDS_FIRST: Final = 0.05
+"""s"""
+_LOWEST: Final = Orders(limit=CurrentLimit(current=MINIMUM_CURRENT))
+
+
+class PolledSmartEvse(SmartEvseBox):
+    """One SmartEVSE that is polled."""
+
+    pauses_hurry: ClassVar = True
+
+    def __init__(self, config: ChargerConfig, orders: Orders) -> None:
+        """Take the set-up; the box is not known before it answers."""
+        super().__init__(config, orders)
+        self._written: int | None = None
+        """The override it has of us, 0.1 A; ``None``: not known."""
+        self._confirmed: int | None = None
+        """The set-point within which it was read back to charge, 0.1 A."""
+        self._fell_back = False
+        self._looked_at = 0.0
+        self._limit_paused = False
+        """Our own 0 A has turned its access off; a higher limit gives it back."""
+        self._needs_quiet = False
+        self._last_request = 0.0
+
+    @override
+    def forget(self) -> None:
+        super().forget()
+        self._written = None
+
+    @override
+    def missed(self, now: float) -> None:
+        super().missed(now)
+        # It may have been switched off and on again.
+        self._written = None
+
+    # -- When ------------------------------------------------------------------------
+
+    @override
+    def turns(self, conversation: Callable[[Talk], Turns]) -> Step[None]:
+        # Nobody else has a deadline here, and one burst costs a later box one quiet.
+        return in_turns(partial(_in_one_go, conversation))
+
+    @property
+    @override
+    def exchanges_per_turn(self) -> int:
+        # Dialect (2), status, settings (2), access and current, both read back.
+        return 10
+
+    @override
+    def minimum_pause(self, now: float) -> float:
+        if self.dialect is not None:
+            self._needs_quiet = self.dialect is Dialect.LATER
+        if not self._needs_quiet:
+            return 0.0
+        # Any request counts, whoever it is for and whoever of us has sent it.
+        sent_at = self.bus.wire.sent_at if self.bus is not None else None
+        self._last_request = max(self._last_request, sent_at or 0.0)
+        return max(0.0, self._last_request + QUIET - now)
+
+    @override
+    def plan(self, now: float) -> None:
+        super().plan(now)
+        # A little after the quiet: a command that waited for its end goes first.
+        quiet = now + self.minimum_pause(now) + COMMANDS_FIRST
+        if self._needs_quiet:
+            self.slot.ready = self.slot.due = max(self.slot.ready, quiet)
+
+    # -- What it says ----------------------------------------------------------------
+
+    @override
+    def take(self, status: Status, now: float) -> None:
+        before = self.status
+        if before is not None and before.maximum and status.maximum is None:
+            # Only a restart forgets the cable.
+            self._written = None
+        super().take(status, now)
+        self._looked_at = now
+        charging = status.raw_state in CHARGING
+        within = charging and not self._is_above(status)
+        setpoint = tenths(self.setpoint)
+        if charging and not within:
+            # Offered more than it had already obeyed.
+            self._fell_back = self._confirmed == setpoint
+        self._confirmed = setpoint if within else None
+        if not self._must_stop() and (within or not charging):
+            self.tell(Fault.LIMIT_NOT_TAKEN, present=False)
+
+    def _is_above(self, status: Status, setpoint: Setpoint | None = None) -> bool:
+        """Return whether more is offered than may be; ahead of a car it is not."""
+        wanted = self.setpoint if setpoint is None else setpoint
+        current = offered(self.known_dialect, status)
+        return current is not None and current > wanted.current
+
+    # -- What must be so ---------------------------------------------------------------
+
+    @override
+    def must_tend(self, now: float) -> bool:
+        return super().must_tend(now) or self._must_stop() or self._must_write()
+
+    @override
+    async def tend(self, talk: Talk) -> Turns:
+        async for pause in self._stop_if_need_be(talk):
+            yield pause
+        if talk.now >= self.configuration_due:
+            # Once in a while the override is written anew: a short failure of its
+            # power may have passed unseen.
+            self._written = None
+        async for pause in super().tend(talk):
+            yield pause
+        # What it may offer is known only now.
+        async for pause in self._stop_if_need_be(talk):
+            yield pause
+        if self._must_write():
+            async for pause in self._follow(talk, lambda: self.setpoint):
+                yield pause
+
+    async def _stop_if_need_be(self, talk: Talk) -> Turns:
+        if self._must_stop():
+            ours = self.effective_orders.allowed is not False
+            async for pause in self._stop(talk, ours=ours):
+                yield pause
+            yield 0.0
+
+    def _must_stop(self) -> bool:
+        """Return whether a car may charge that must not."""
+        if self.status is None or not self.setpoint.paused:
+            return False
+        return not is_stopped(self.known_dialect, self.status)
+
+    async def _stop(self, talk: Talk, *, ours: bool) -> Turns:
+        """Turn access off; what our own limit takes away it may give back."""
+        had_access = self.status is None or self.status.access
+        try:
+            async for pause in self.set_access(talk, allowed=False):
+                yield pause
+        except NotConfirmedError:
+            self.tell(Fault.LIMIT_NOT_TAKEN, present=True)
+            raise
+        self._limit_paused = ours and (had_access or self._limit_paused)
+
+    def _must_write(self) -> bool:
+        status = self.status
+        if status is None:
+            return False
+        ahead = self._ahead(status, self.setpoint)
+        if ahead is None:
+            return False
+        if status.raw_state in CHARGING and self._is_above(status, ahead):
+            return True
+        return self._written != tenths(ahead)
+
+    def _ahead(self, status: Status, setpoint: Setpoint) -> Setpoint | None:
+        """Return what the override should be now; ``None``: cannot be said.
+
+        The cable of the car that comes is not known before it is there, and the
+        override counts more than the box's own knowledge of it: 6 A until then.
+        """
+        dialect = self.known_dialect
+        plugged = (
+            tells_plug(dialect, status) and state_of(dialect, status.raw_state).plugged
+        )
+        if plugged and not setpoint.paused:
+            return setpoint
+        limits = replace(self.limits, reported=MINIMUM_CURRENT, minimum=MINIMUM_CURRENT)
+        lowest = clamp(_LOWEST, limits)
+        return None if lowest.paused else lowest
+
+    # -- The current -----------------------------------------------------------------
+
+    async def _follow(self, talk: Talk, wanted: Callable[[], Setpoint]) -> Turns:
+        """Write the override; while a car charges, until it is read back.
+
+        Raises NotConfirmedError when the box offers more than was written.
+        """
+        for _ in range(WRITES):
+            async for pause in self.reach(talk):
+                yield pause
+            status = self.status
+            if status is None:
+                continue
+            if self._fell_back:
+                self.statistics.reasserted += 1
+                self._fell_back = False
+            await self._write_current(talk, status, wanted)
+            if status.raw_state not in CHARGING:
+                return
+            if self.known_dialect is not Dialect.LATER:
+                yield LOOK_AGAIN
+            async for pause in self._settle(talk, wanted):
+                yield pause
+            status = self.status
+            if (
+                status is None
+                or status.raw_state not in CHARGING
+                or not self._is_above(status, wanted())
+            ):
+                return
+            yield 0.0
+        self.tell(Fault.LIMIT_NOT_TAKEN, present=True)
+        message = f"{self.config.name} does not follow its limit"
+        raise NotConfirmedError(message)
+
+    async def _write_current(
+        self, talk: Talk, status: Status, wanted: Callable[[], Setpoint]
+    ) -> None:
+        dialect = self.known_dialect
+        sent: list[int] = []
+
+        def request() -> bytes:
+            setpoint = self._ahead(status, wanted())
+            if setpoint is None:
+                message = f"{self.config.name}: no current may be offered"
+                raise RefusedOrderError(message)
+            sent.append(tenths(setpoint))
+            return write_current(self.config.address, dialect, setpoint)
+
+        answer = await self.write(talk, request, MAPS[dialect].current_register)
+        self._written = None if answer is None or not sent else sent[-1]
+
+    async def _settle(self, talk: Talk, wanted: Callable[[], Setpoint]) -> Turns:
+        """Look until the box offers what was written, or had the time to."""
+        if self.known_dialect is Dialect.LATER:
+            # Looking sooner would keep it from following; a poll may look for us.
+            written_at = talk.now
+            while self._looked_at < written_at:
+                while (pause := self.minimum_pause(talk.now)) > 0:
+                    yield pause
+                if self._looked_at < written_at:
+                    async for pause in self.see(talk):
+                        yield pause
+            return
+        until = talk.now + SETTLING
+        while True:
+            async for pause in self.see(talk):
+                yield pause
+            status = self.status
+            if (
+                talk.now >= until
+                or status is None
+                or status.raw_state not in CHARGING
+                or offered(self.known_dialect, status) == wanted().current
+            ):
+                return
+            yield LOOK_AGAIN
+
+    # -- Orders ----------------------------------------------------------------------
+
+    @override
+    async def impose(
+        self, talk: Talk, orders: Orders, change: OrderChange
+    ) -> Later[None] | None:
+        return await self.turns(partial(self._impose, orders, change))(talk)
+
+    async def _impose(self, orders: Orders, change: OrderChange, talk: Talk) -> Turns:
+        token = self.begin()
+        try:
+            async for pause in self.reach(talk):
+                yield pause
+            if self.configuration is None and change.allowed is not False:
+                # Without its own limits it would get 6 A first.
+                async for pause in self.read_configuration(talk):
+                    yield pause
+            if clamp(self.target(change), self.limits).paused:
+                if self._must_pause(change):
+                    ours = orders.allowed is not False
+                    async for pause in self._stop(talk, ours=ours):
+                        yield pause
+                return
+            async for pause in self._allow(talk, change):
+                yield pause
+        finally:
+            self.end(token)
+
+    def _must_pause(self, change: OrderChange) -> bool:
+        """Return whether a pause has to be said: the user's always, at once."""
+        return change.allowed is False or (
+            self.status is None or not is_stopped(self.known_dialect, self.status)
+        )
+
+    async def _allow(self, talk: Talk, change: OrderChange) -> Turns:
+        """Let the box follow orders that let a car charge."""
+
+        def wanted() -> Setpoint:
+            return clamp(self.target(change), self.limits)
+
+        async for pause in self._follow(talk, wanted):
+            yield pause
+        yield 0.0
+        if not self._may_start(change):
+            return
+        if wanted().paused:
+            # Lowered to a pause while we were at it; that one is on its way.
+            return
+        async for pause in self.set_access(talk, allowed=True):
+            yield pause
+        self._limit_paused = False
+
+    def _may_start(self, change: OrderChange) -> bool:
+        """Return whether access is to be turned on: nobody's change of a limit does.
+
+        The user's word does, and a limit gives back what only a limit of 0 A took.
+        """
+        if change.allowed is True:
+            return True
+        asked = change.current is not None or any(
+            phase is not None for phase in change.phases
+        )
+        return (
+            asked
+            and self._limit_paused
+            and self.target(change).allowed is not False
+            and (self.status is None or not self.status.access)
+        )
+
+    # -- Commands --------------------------------------------------------------------
+
+    @override
+    async def command(
+        self, command: Command, value: bool | int | str | None = None
+    ) -> None:
+        if command is not Command.SET_MODE:
+            await super().command(command, value)
+            return
+        conversation = mode_conversation(self, value)
+        await self.run(self.turns(conversation), persistence=Persistence.REPEATABLE)
+
+    # -- Who else is there -------------------------------------------------------------
+
+    @override
+    async def write(self, talk: Talk, request: Request, register: int) -> bool | None:
+        self._check_alone()
+        return await super().write(talk, request, register)
+
+    def _check_alone(self) -> None:
+        """Raise DuplicateAddressError where a write would reach others too.
+
+        2.17 without load balancing has the address at which all others listen.
+        """
+        others = self.bus is not None and len(self.bus.chargers) > 1
+        shared = self.config.address == 0 and others
+        self.tell(Fault.DUPLICATE_ADDRESS, present=shared)
+        if shared:
+            message = (
+                f"{self.config.name} has address 0, at which every SmartEVSE listens: "
+                "nothing is written while others are on its bus"
+            )
+            raise DuplicateAddressError(message)
+
+    # -- The end ---------------------------------------------------------------------
+
+    @override
+    async def farewell(self) -> None:
+        if polled_config(self.config).stop_on_shutdown:
+            await self.run(
+                self.turns(partial(self.set_access, allowed=False)),
+                persistence=Persistence.STANDING,
+                kind=Kind.PAUSE,
+            )
+
+
+async def _in_one_go(conversation: Callable[[Talk], Turns], talk: Talk) -> Turns:
+    """Leave the pauses out that are only there to let others speak."""
+    async for pause in conversation(talk):
+        if pause > 0:
+            yield pause
+
+
+__all__ = ["PolledConfig", "PolledSmartEvse"]
