@@ -11,11 +11,13 @@ import threading
 import time
 from typing import TYPE_CHECKING
 
+from . import ews_cli
 from .abl import AblBox
 from .bus import VirtualBus
 from .car import Car, CarLife
 from .control import HELP, Control, describe
 from .evbox import EvboxChargePoint, Module
+from .ews_box import EwsBox
 from .smartevse import SmartEvse
 from .smartevse_registers import DIALECTS
 
@@ -30,7 +32,7 @@ STATUS_INTERVAL = 5.0
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run until SIGTERM, SIGINT, or the end of --duration."""
     options = _parser().parse_args(arguments)
-    make = {"abl": _abl, "evbox": _evbox, "smartevse": _smartevse}
+    make = {"abl": _abl, "evbox": _evbox, "smartevse": _smartevse, "ews": _ews}
     devices = make[options.protocol](options)
     for device in devices:
         if _number(device) in options.dead:
@@ -42,7 +44,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "granularity": options.granularity,
         "seed": options.seed,
     }
-    if options.tcp is not None:
+    if options.protocol == "ews" and options.dial:
+        bus = ews_cli.fleet(options, devices, settings)
+    elif options.tcp is not None:
         bus = VirtualBus.tcp(*devices, port=options.tcp, **settings)
     else:
         bus = VirtualBus.pty(*devices, link=options.pty or None, **settings)
@@ -95,7 +99,9 @@ def _number(device: Device) -> int:
         return device.device_id
     if isinstance(device, SmartEvse):
         return device.unit
-    return int(device.serial) if isinstance(device, EvboxChargePoint) else 0
+    if isinstance(device, EvboxChargePoint | EwsBox):
+        return int(device.serial)
+    return 0
 
 
 def _car(options: argparse.Namespace, index: int) -> Car:
@@ -183,6 +189,10 @@ def _smartevse(options: argparse.Namespace) -> list[Device]:
     return boxes
 
 
+def _ews(options: argparse.Namespace) -> list[Device]:
+    return ews_cli.boxes(options, _car)
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="virtual-chargers",
@@ -231,6 +241,9 @@ def _parser() -> argparse.ArgumentParser:
     add("--serial", type=int, default=1, help="of the first box; dialect later only")
     add("--no-override", action="store_true", help="ignores a charging current")
     add("--turn-round", type=float, default=0.01, metavar="S")
+    ews = kinds.add_parser("ews", help="P-CHARGE EWS-Boxes (MCS binary)")
+    _common(ews.add_argument)
+    ews_cli.add_arguments(ews.add_argument)
     return parser
 
 

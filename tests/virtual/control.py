@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from . import ews_cli
 from .abl import AblBox
 from .evbox import EvboxChargePoint
+from .ews_box import EwsBox
 from .smartevse import SmartEvse
 
 if TYPE_CHECKING:
@@ -19,7 +21,7 @@ HELP = (
     "plug|request|finish|leave ID[.MODULE]; dead|alive|power-cycle ID;"
     " fail ID N; clear ID; stop|start ID; others ID A;"
     " press ID; menu ID SETTING N; temperature ID C;"
-    " unplug-adapter; replug-adapter; advance S; status"
+    f" unplug-adapter; replug-adapter; advance S; status; {ews_cli.HELP}"
 )
 
 
@@ -58,14 +60,20 @@ class Control:
                 "leave": car.leave,
             }[word]()
         else:
-            self._device_command(word, self._device(values[0]), values[1:])
+            device = self._device(values[0])
+            port = int(values[0].partition(".")[2] or 1)
+            if not (
+                isinstance(device, EwsBox)
+                and ews_cli.command(device, word, port, values[1:])
+            ):
+                self._device_command(word, device, values[1:])
         return "ok"
 
     def _device_command(self, word: str, device: Device, values: list[str]) -> None:
         if word in ("dead", "alive"):
             device.faults.dead = word == "dead"
         elif word == "power-cycle" and isinstance(
-            device, AblBox | EvboxChargePoint | SmartEvse
+            device, AblBox | EvboxChargePoint | SmartEvse | EwsBox
         ):
             device.power_cycle()
         elif isinstance(device, SmartEvse):
@@ -103,12 +111,15 @@ class Control:
             raise ValueError(msg)
 
     def _device(self, key: str) -> Device:
+        key = key.partition(".")[0]
         for device in self._bus.devices:
             if isinstance(device, AblBox) and device.device_id == int(key):
                 return device
             if isinstance(device, SmartEvse) and device.unit == int(key):
                 return device
-            if isinstance(device, EvboxChargePoint) and int(device.serial) == int(key):
+            if not isinstance(device, EvboxChargePoint | EwsBox):
+                continue
+            if int(device.serial) == int(key):
                 return device
         msg = f"no charger {key}"
         raise KeyError(msg)
@@ -123,6 +134,8 @@ class Control:
             car = device.car
         elif isinstance(device, EvboxChargePoint):
             car = device.modules[int(module or 1) - 1].car
+        elif isinstance(device, EwsBox):
+            car = device.ports[int(module or 1) - 1].car
         if car is None:
             msg = f"no car at {key}"
             raise KeyError(msg)
@@ -131,12 +144,16 @@ class Control:
 
 def describe(bus: VirtualBus) -> str:
     """Return the state of all chargers, a line each (on the bus thread)."""
+    if isinstance(bus, ews_cli.EwsFleet):
+        return "\n".join(describe(dialler) for dialler in bus.diallers)
     client = "connected" if bus.connected else "away"
     traffic = f"{bus.log.total} transmissions, {bus.wire.collisions} collisions"
     lines = [f"{bus.url}: client {client}, {traffic}"]
     for device in bus.devices:
         dead = " (dead)" if device.faults.dead else ""
-        if isinstance(device, AblBox):
+        if isinstance(device, EwsBox):
+            lines.append(f"  {device.name}{dead}: {ews_cli.describe_box(device)}")
+        elif isinstance(device, AblBox):
             currents = "/".join(f"{c:.1f}" for c in device.outlet.phase_currents)
             lines.append(
                 f"  {device.name}{dead}: {device.state}, may {device.ic_amps:.1f} A,"

@@ -1,0 +1,216 @@
+"""The shell's way to virtual EWS-Boxes: arguments, many diallers, commands."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, cast
+
+from .ews_box import EwsBox
+from .ews_dialler import EwsDialler
+from .ews_rfid import Card
+from .faults import Faults
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Callable
+    from types import TracebackType
+    from typing import Self, TypeVar
+
+    from .bus import VirtualBus
+    from .car import Car
+    from .device import Device
+
+    T = TypeVar("T")
+
+HELP = (
+    "EWS: press ID.PORT KEY [S]; card ID [GROUP CARD]; remove-card ID;"
+    " web-start|web-stop ID.PORT; rcd|fan ID.PORT on|off;"
+    " jam ID.PORT lock|unlock|free; plug-cable|pull-cable ID.PORT; hang-up|vanish ID"
+)
+FIRST_SERIAL = 12345678901
+
+
+class EwsFleet:
+    """Many boxes that dial the same server, on one thread, handled like one bus."""
+
+    def __init__(
+        self,
+        boxes: list[EwsBox],
+        host: str,
+        port: int,
+        **options: float | None,
+    ) -> None:
+        """Make a dialler for each box."""
+        self.faults = Faults()
+        self.diallers: list[EwsDialler] = []
+        for box in boxes:
+            first = self.diallers[0] if self.diallers else None
+            dialler = EwsDialler(box, host, port, on=first, **options)  # type: ignore[arg-type]
+            dialler.faults = dialler.wire.faults = self.faults
+            self.diallers.append(dialler)
+        self.url = f"dial://{host}:{port}"
+
+    def __enter__(self) -> Self:
+        """Begin to dial."""
+        for dialler in self.diallers:
+            dialler.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Hang up; the thread is the first one's and ends with it."""
+        for dialler in reversed(self.diallers):
+            dialler.stop()
+
+    @property
+    def devices(self) -> list[Device]:
+        """Return all boxes."""
+        return [device for dialler in self.diallers for device in dialler.devices]
+
+    def call(self, function: Callable[[], T]) -> T:
+        """Run a function on the thread."""
+        return self.diallers[0].call(function)
+
+    def unplug(self) -> None:
+        """Pull the network cable of all."""
+        for dialler in self.diallers:
+            dialler.unplug()
+
+    def replug(self) -> None:
+        """Put it back."""
+        for dialler in self.diallers:
+            dialler.replug()
+
+    def advance(self, seconds: float) -> None:
+        """Let time pass for all."""
+        for dialler in self.diallers:
+            dialler.advance(seconds)
+
+    def stats(self) -> dict[str, object]:
+        """Return the counters of all."""
+        return {
+            "url": self.url,
+            "attempts": sum(dialler.attempts for dialler in self.diallers),
+            "connected": sum(dialler.connected for dialler in self.diallers),
+            "dropped": {d.box.name: d.dropped for d in self.diallers if d.dropped},
+            "devices": {d.name: d.stats() for d in self.devices},
+        }
+
+
+def add_arguments(add: Callable[..., object]) -> None:
+    """Add the arguments of `virtual-chargers ews`."""
+    add("--dial", metavar="HOST:PORT", help="the boxes dial this server")
+    add("--retry", type=float, default=0.5, metavar="S", help="between two attempts")
+    add("--serials", nargs="+", metavar="SERIAL", help="12 digits each")
+    add("--count", type=int, default=1, help="so many boxes, if without --serials")
+    add("--jumper", type=int, default=32, choices=[13, 20, 32, 63, 70])
+    add("--max-current", type=int, default=0, metavar="A", help="0 = the jumper's")
+    add("--standalone", action="store_true", help="not in server mode")
+    add("--rfid", action="store_true", help="with card authentication")
+    add("--manual-io", action="store_true", help="keys and LEDs are the server's")
+    add("--exclusive", action="store_true", help="one port at a time")
+    add("--fixed-cable", action="store_true")
+    add("--fan", action="store_true", help="with ventilation")
+    add("--restart-after-power", action="store_true")
+    add("--bcc", choices=["all", "without_msgid"], default="all")
+    add("--masking", choices=["no", "zeros", "stars"], default="no")
+
+
+def boxes(
+    options: argparse.Namespace,
+    car: Callable[[argparse.Namespace, int], Car],
+) -> list[Device]:
+    """Make the boxes that were asked for, with two cars each."""
+    serials = options.serials or [
+        f"{FIRST_SERIAL + number:012d}" for number in range(options.count)
+    ]
+    if len(serials) > 1 and not options.dial:
+        msg = "one box a serial line: several boxes can only --dial"
+        raise SystemExit(msg)
+    return [
+        EwsBox(
+            serial=serial,
+            cars=(car(options, 2 * index), car(options, 2 * index + 1)),
+            jumper=options.jumper,
+            max_current=options.max_current,
+            mode="standalone" if options.standalone else "server",
+            bcc=options.bcc,
+            rfid=options.rfid,
+            manual_io=options.manual_io,
+            exclusive=options.exclusive,
+            fixed_cable=options.fixed_cable,
+            fan=options.fan,
+            restart_after_power=options.restart_after_power,
+            masking=options.masking,
+        )
+        for index, serial in enumerate(serials)
+    ]
+
+
+def fleet(
+    options: argparse.Namespace, devices: list[Device], settings: dict[str, object]
+) -> VirtualBus:
+    """Let the boxes dial; the result does all that the script asks of a bus."""
+    host, _, port = options.dial.rpartition(":")
+    chosen = {
+        key: value for key, value in settings.items() if key not in ("baud", "parity")
+    }
+    made = EwsFleet(
+        cast("list[EwsBox]", devices),
+        host or "127.0.0.1",
+        int(port),
+        retry=options.retry,
+        **cast("dict[str, float]", chosen),
+    )
+    return cast("VirtualBus", made)
+
+
+def command(box: EwsBox, word: str, port: int, values: list[str]) -> bool:
+    """Do a command of the control's; False if it is not one of a box."""
+    charging_port = box.ports[port - 1]
+    if word == "press":
+        seconds = float(values[1]) if len(values) > 1 else 0.3
+        box.press_key(port, int(values[0]), seconds)
+    elif word == "card":
+        numbers = [int(value) for value in values[:2]]
+        box.present_card(Card(*numbers))
+    elif word == "remove-card":
+        box.remove_card()
+    elif word in ("web-start", "web-stop"):
+        (box.start_on_web_page if word == "web-start" else box.stop_on_web_page)(port)
+    elif word == "rcd":
+        box.trip_rcd(port, tripped=values[0] == "on")
+    elif word == "fan":
+        charging_port.wants_fan = values[0] == "on"
+    elif word == "jam":
+        jammed = {"lock": "lock", "unlock": "unlock", "free": ""}[values[0]]
+        charging_port.lock.jammed = jammed  # type: ignore[assignment]
+    elif word in ("plug-cable", "pull-cable"):
+        (
+            charging_port.plug_cable
+            if word == "plug-cable"
+            else charging_port.pull_cable
+        )()
+    elif word in ("hang-up", "vanish") and isinstance(box.bus, EwsDialler):
+        (box.bus.hang_up if word == "hang-up" else box.bus.vanish)()
+    else:
+        return False
+    return True
+
+
+def describe_box(box: EwsBox) -> str:
+    """Return the state of both ports in words."""
+    parts = []
+    for port in box.ports:
+        marks = "".join(
+            mark for mark, holds in (("L", port.locked), ("K", port.contactor)) if holds
+        )
+        parts.append(
+            f"{port.number}: {port.status:#04x} {marks or '-'}"
+            f" may {port.offered} A, draws {max(port.currents):.1f} A"
+        )
+    linked = "connected" if box.server_connected else "no server"
+    return f"{', '.join(parts)}; {linked}, {box.requests} commands"
