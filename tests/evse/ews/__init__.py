@@ -1,0 +1,1 @@
+"""The EWS-Box, as the manual has it."""
