@@ -45,6 +45,12 @@ def quick_search(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(PROTOCOLS, "abl", replace(abl, timing=timing))
     evbox_scan = "custom_components.evse_bus.evse.evbox.scan"
     monkeypatch.setattr(sys.modules[evbox_scan], "RETRY_PAUSE", 0.2)
+    for key in ("smartevse", "smartevse_master"):
+        smartevse = PROTOCOLS[key]
+        timing = replace(smartevse.timing, reply_timeout=0.12)
+        monkeypatch.setitem(PROTOCOLS, key, replace(smartevse, timing=timing))
+    master = "custom_components.evse_bus.evse.smartevse.master"
+    monkeypatch.setattr(sys.modules[master], "LISTENING", 0.3)
 
 
 @pytest.fixture

@@ -1,0 +1,292 @@
+"""Adding a SmartEVSE to a bus that runs, and changing one, as a person does it."""
+
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+from homeassistant.config_entries import ConfigEntryState, ConfigSubentry
+from homeassistant.data_entry_flow import FlowResultType
+import pytest
+from pytest_homeassistant_custom_component.common import MockConfigEntry
+
+from tests.common import charger as stored_charger, setup_bus
+from tests.flow import NOWHERE, Flow, charger, fields
+from tests.virtual import SmartEvse, VirtualBus
+
+if TYPE_CHECKING:
+    from homeassistant.core import HomeAssistant
+
+pytestmark = pytest.mark.usefixtures("quick_search")
+
+SUPPLY = {"supply_limit": 20.0, "supply_minimum": 6.0}
+LONGEST_SILENCE = 2.5
+"""Between two broadcasts, which are due every 2 s; a slave stops after 10 s."""
+
+
+def slave(unit: int) -> SmartEvse:
+    return SmartEvse(load_balance=unit)
+
+
+def get(entry: MockConfigEntry, title: str) -> ConfigSubentry:
+    return next(one for one in entry.subentries.values() if one.title == title)
+
+
+async def master_bus(
+    hass: HomeAssistant, url: str, *units: int, **options: object
+) -> MockConfigEntry:
+    stored = [
+        stored_charger("smartevse_master", unit, poll_interval=1) for unit in units
+    ]
+    return await setup_bus(hass, "smartevse_master", url, *stored, **SUPPLY, **options)
+
+
+async def take_down(hass: HomeAssistant, entry: MockConfigEntry) -> None:
+    assert await hass.config_entries.async_unload(entry.entry_id)
+    await hass.async_block_till_done()
+
+
+# -- Adding ------------------------------------------------------------------------
+
+
+async def test_searches_leave_the_broadcasts_in_time(hass: HomeAssistant) -> None:
+    box = slave(2)
+    with VirtualBus.pty(box, slave(3)) as bus:
+        entry = await master_bus(hass, bus.url, 2)
+        await bus.wait_for_async(lambda: box.broadcasts)
+        while len(box.broadcasts) < 3:
+            flow = await Flow.add_charger(hass, entry)
+            await flow.choose("scan")
+            await flow.wait()
+            assert flow.step == "select"
+            flow.abort()
+        heard = [one.t for one in box.broadcasts]
+        gaps = [later - earlier for earlier, later in pairwise(heard)]
+        assert max(gaps) < LONGEST_SILENCE
+        assert not box.error
+        await take_down(hass, entry)
+
+
+async def test_slave_is_added_to_a_bus_that_runs(hass: HomeAssistant) -> None:
+    first, second = slave(2), slave(3)
+    with VirtualBus.pty(first, second) as bus:
+        entry = await master_bus(hass, bus.url, 2)
+        running = entry.runtime_data.bus
+        await bus.wait_for_async(lambda: first.broadcasts)
+        flow = await Flow.add_charger(hass, entry)
+        assert flow.step == "user"
+        assert flow.result["menu_options"] == ["scan", "manual"]
+        await flow.choose("scan")
+        await flow.wait()
+        assert flow.step == "select"
+        assert fields(flow)["chargers"] == "3"
+        assert flow.progress[-1] == 1
+        assert not second.writes
+        await flow.submit({"chargers": "3", "installation_limit": 13})
+        assert flow.tells("firmware 2.17 at 3")
+        await flow.submit(charger("New", 13))
+        assert flow.step == "confirm_smartevse_master"
+        assert flow.tells("at most 20 A", "for 10 s")
+        await flow.submit()
+        assert flow.result["type"] is FlowResultType.CREATE_ENTRY
+        await hass.async_block_till_done()
+
+        new = get(entry, "New")
+        assert new.unique_id == "smartevse_master_address_3"
+        assert new.data["address"] == 3
+        # In place: the bus was neither closed nor opened again, and nobody stopped.
+        assert entry.runtime_data.bus is running
+        assert bus.opened == 1
+        assert new.subentry_id in running.chargers
+        await bus.wait_for_async(
+            lambda: second.broadcasts and second.broadcasts[-1].currents[2] > 0
+        )
+        await take_down(hass, entry)
+
+
+async def test_slave_that_is_there_already_is_refused(hass: HomeAssistant) -> None:
+    with VirtualBus.pty(slave(2)) as bus:
+        entry = await master_bus(hass, bus.url, 2)
+        flow = await Flow.add_charger(hass, entry)
+        await flow.choose("scan")
+        await flow.wait()
+        assert flow.step == "nothing_new"
+        await flow.choose("manual")
+        await flow.submit({"slave": "2"})
+        assert flow.errors == {"slave": "address_taken"}
+        await flow.submit({"slave": "4"})
+        await flow.submit(charger("Not there yet"))
+        await flow.submit()
+        await hass.async_block_till_done()
+        assert get(entry, "Not there yet").data["address"] == 4
+        assert bus.opened == 1
+        await take_down(hass, entry)
+
+
+async def test_slave_with_another_firmware_is_told(hass: HomeAssistant) -> None:
+    with VirtualBus.pty(slave(2), SmartEvse("later", load_balance=3)) as bus:
+        entry = await master_bus(hass, bus.url, 2)
+        flow = await Flow.add_charger(hass, entry)
+        await flow.choose("scan")
+        await flow.wait()
+        assert flow.step == "unsupported"
+        assert flow.result["menu_options"] == ["scan", "manual"]
+        assert flow.tells("firmware later than 2.20")
+        flow.abort()
+        await take_down(hass, entry)
+
+
+async def test_search_beside_another_master(hass: HomeAssistant) -> None:
+    first = slave(2)
+    with VirtualBus.pty(first) as bus:
+        entry = await master_bus(hass, bus.url, 2)
+        await bus.wait_for_async(lambda: first.broadcasts)
+        bus.add(SmartEvse(load_balance=1))
+        flow = await Flow.add_charger(hass, entry)
+        duty = entry.runtime_data.bus.duty
+        # Once the two did not speak at the same time.
+        await bus.wait_for_async(lambda: duty.noticed, timeout=15)
+        await flow.choose("scan")
+        await flow.wait()
+        assert flow.step == "other_master"
+        assert flow.result["menu_options"] == ["scan", "manual"]
+        flow.abort()
+        await take_down(hass, entry)
+
+
+async def test_slave_is_added_to_a_bus_that_is_not_running(
+    hass: HomeAssistant,
+) -> None:
+    entry = await master_bus(hass, NOWHERE)
+    assert entry.state is ConfigEntryState.SETUP_RETRY
+    flow = await Flow.add_charger(hass, entry)
+    assert flow.step == "manual"
+    await flow.submit({"slave": "3"})
+    await flow.submit(charger("Three"))
+    await flow.submit()
+    await hass.async_block_till_done()
+    assert get(entry, "Three").data["address"] == 3
+
+
+async def test_no_second_box_on_a_bus_that_polls(hass: HomeAssistant) -> None:
+    entry = await setup_bus(
+        hass, "smartevse", NOWHERE, stored_charger("smartevse", 0, title="Box")
+    )
+    flow = await Flow.add_charger(hass, entry)
+    assert flow.result["type"] is FlowResultType.ABORT
+    assert flow.result["reason"] == "one_box"
+
+    # Its place is free again when it was removed.
+    hass.config_entries.async_remove_subentry(entry, get(entry, "Box").subentry_id)
+    flow = await Flow.add_charger(hass, entry)
+    assert flow.step == "manual"
+    await flow.submit({"unit": "1"})
+    await flow.submit(charger("Other") | {"stop_on_shutdown": True})
+    assert flow.step == "confirm_smartevse"
+    await flow.submit()
+    assert get(entry, "Other").data["stop_on_shutdown"] is True
+
+
+# -- Changing ----------------------------------------------------------------------
+
+
+async def test_polled_box_is_changed_in_place(hass: HomeAssistant) -> None:
+    box = SmartEvse("later", serial=4711)
+    with VirtualBus.pty(box) as bus:
+        stored = stored_charger("smartevse", 1, serial="4711", title="Box")
+        entry = await setup_bus(hass, "smartevse", bus.url, stored)
+        flow = await Flow.change_charger(hass, entry, get(entry, "Box"))
+        offered = fields(flow)
+        assert offered["unit"] == "1"
+        assert offered["serial"] == "4711"
+        assert offered["stop_on_shutdown"] is False
+        assert "order_lifetime" not in offered
+        typed = {
+            "name": "Car port",
+            "unit": "1",
+            "serial": "4711",
+            "installation_limit": 10,
+            "order_lifetime": 20,
+            "stop_on_shutdown": True,
+            "expert": {"poll_interval": 5, "voltage": 230},
+        }
+        await flow.submit(typed | {"order_lifetime": "nan"})
+        assert flow.errors == {"order_lifetime": "not_a_number"}
+        await flow.submit(typed)
+        assert flow.result["reason"] == "reconfigure_successful"
+        await hass.async_block_till_done()
+        changed = get(entry, "Car port")
+        assert changed.unique_id == "smartevse_4711"
+        assert changed.data["installation_limit"] == 10
+        assert changed.data["order_lifetime"] == 20
+        assert changed.data["stop_on_shutdown"] is True
+        assert changed.data["fail_safe_current"] == 6
+        [running] = entry.runtime_data.bus.chargers.values()
+        assert running.config.installation_limit == 10
+        assert running.config.order_lifetime == 20 * 60
+        assert running.config.stop_on_shutdown is True
+        assert bus.opened == 1
+
+        flow = await Flow.change_charger(hass, entry, changed)
+        offered = fields(flow)
+        assert offered["order_lifetime"] == 20
+        assert offered["stop_on_shutdown"] is True
+        flow.abort()
+        await take_down(hass, entry)
+
+
+async def test_slave_is_changed_in_place(hass: HomeAssistant) -> None:
+    first, second = slave(2), slave(3)
+    with VirtualBus.pty(first, second) as bus:
+        entry = await master_bus(hass, bus.url, 2, 3)
+        flow = await Flow.change_charger(hass, entry, get(entry, "Charger 3"))
+        assert fields(flow)["slave"] == "3"
+        assert "serial" not in flow.result["data_schema"].schema
+        typed = {
+            "name": "Right",
+            "slave": "2",
+            "installation_limit": 13,
+            "expert": {"poll_interval": 2, "voltage": 230},
+        }
+        await flow.submit(typed)
+        assert flow.errors == {"slave": "address_taken"}
+        await flow.submit(typed | {"slave": "4"})
+        assert flow.result["reason"] == "reconfigure_successful"
+        await hass.async_block_till_done()
+        right = get(entry, "Right")
+        assert right.unique_id == "smartevse_master_address_4"
+        assert right.data["address"] == 4
+        assert right.data["installation_limit"] == 13
+        assert bus.opened == 1
+        await take_down(hass, entry)
+
+
+async def test_shared_supply_is_changed_while_the_slaves_hear_their_master(
+    hass: HomeAssistant,
+) -> None:
+    box = slave(2)
+    with VirtualBus.pty(box) as bus:
+        entry = await master_bus(hass, bus.url, 2)
+        await bus.wait_for_async(lambda: box.broadcasts)
+        flow = await Flow.change_bus(hass, entry)
+        assert fields(flow) == {
+            "device": bus.url,
+            "supply_limit": 20,
+            "supply_minimum": 6,
+            "line": {"baudrate": 9600, "parity": "n", "stop_bits": "1"},
+        }
+        typed = {"device": bus.url, "supply_limit": 9, "supply_minimum": 10, "line": {}}
+        await flow.submit(typed)
+        assert flow.errors == {"supply_minimum": "above_supply"}
+        await flow.submit(typed | {"supply_minimum": 8})
+        assert flow.result["reason"] == "reconfigure_successful"
+        await hass.async_block_till_done()
+        assert entry.data == {
+            "protocol": "smartevse_master",
+            "device": bus.url,
+            "supply_limit": 9,
+            "supply_minimum": 8,
+        }
+        assert entry.state is ConfigEntryState.LOADED
+        supply = entry.runtime_data.bus.duty.supply
+        assert (supply.limit, supply.minimum) == (9, 8)
+        assert bus.opened == 1
+        await take_down(hass, entry)
