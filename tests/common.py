@@ -1,7 +1,7 @@
 """Helpers of the tests that run the integration inside Home Assistant."""
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from typing import Any
 
@@ -23,7 +23,7 @@ from homeassistant.helpers.event import async_track_state_change_event
 from pytest_homeassistant_custom_component.common import MockConfigEntry
 
 from custom_components.evse_bus.const import DOMAIN, SUBENTRY_CHARGER
-from tests.virtual import AblBox, EvboxChargePoint, VirtualBus
+from tests.virtual import AblBox, EvboxChargePoint, SmartEvse, VirtualBus
 from tests.virtual.device import Device
 
 PATIENCE = 15.0
@@ -32,6 +32,8 @@ PATIENCE = 15.0
 _EXTRA: dict[str, dict[str, Any]] = {
     "abl": {"phase_order": [1, 2, 3]},
     "evbox": {"command": 68, "information": "00" * 16, "fail_safe_timeout": 60},
+    "smartevse": {},
+    "smartevse_master": {},
 }
 
 
@@ -107,21 +109,36 @@ def charger_of(device: Device, **data: object) -> ConfigSubentryDataWithId:
     """Return the subentry of a virtual charger."""
     if isinstance(device, AblBox):
         return charger("abl", device.device_id, serial=device.serial, **data)
+    if isinstance(device, SmartEvse):
+        return charger(protocol_of(device), device.unit, **data)
     assert isinstance(device, EvboxChargePoint)
     number = int(device.serial)
     return charger("evbox", number, serial=str(number), **data)
+
+
+def protocol_of(device: Device) -> str:
+    """Return how a virtual charger is spoken to."""
+    if isinstance(device, SmartEvse) and device.outlet.slave:
+        return "smartevse_master"
+    return device.protocol
 
 
 @asynccontextmanager
 async def running(
     hass: HomeAssistant,
     *devices: Device,
+    time_scale: float = 1.0,
+    supply: Mapping[str, float] | None = None,
     **data: object,
 ) -> AsyncIterator[tuple[MockConfigEntry, VirtualBus]]:
-    """Run a virtual bus with its chargers set up; unload before the port goes."""
-    with VirtualBus.pty(*devices) as bus:
+    """Run a virtual bus with its chargers set up; unload before the port goes.
+
+    ``time_scale``: the devices' time runs faster; ``supply``: what they share.
+    """
+    with VirtualBus.pty(*devices, time_scale=time_scale) as bus:
         chargers = [charger_of(device, **data) for device in devices]
-        entry = await setup_bus(hass, devices[0].protocol, bus.url, *chargers)
+        protocol = protocol_of(devices[0])
+        entry = await setup_bus(hass, protocol, bus.url, *chargers, **(supply or {}))
         assert entry.state is ConfigEntryState.LOADED, entry.reason
         try:
             yield entry, bus

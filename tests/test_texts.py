@@ -22,6 +22,8 @@ from custom_components.evse_bus.issues import (
     SECOND_MASTER,
     SUPPLY_LOST,
     TIMEOUT_RAISED,
+    UNKNOWN_FIRMWARE,
+    UNSUPPORTED_FIRMWARE,
 )
 from tests.flow import english
 
@@ -103,4 +105,6 @@ def test_issues_have_texts() -> None:
         SECOND_MASTER,
         SUPPLY_LOST,
         TIMEOUT_RAISED,
+        UNKNOWN_FIRMWARE,
+        UNSUPPORTED_FIRMWARE,
     }

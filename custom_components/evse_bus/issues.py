@@ -25,8 +25,9 @@ SECOND_MASTER: Final = "second_master"
 _FAULT_KEYS: Final[Mapping[Fault, str]] = {
     Fault.WRONG_CHARGER: "wrong_charger",
     Fault.DUPLICATE_ADDRESS: "duplicate_address",
-    Fault.UNSUPPORTED_FIRMWARE: "unsupported_firmware",
 }
+UNKNOWN_FIRMWARE: Final = "unknown_firmware"
+UNSUPPORTED_FIRMWARE: Final = "unsupported_firmware"
 
 
 class BusIssues:
@@ -103,7 +104,25 @@ class BusIssues:
                     "expected": config.serial or "-",
                 },
             )
+        self._check_firmware(unit)
         self._check_timeout(unit)
+
+    def _check_firmware(self, unit: ChargerUnit) -> None:
+        """Note a firmware that is not known, or that this bus cannot use."""
+        charger = unit.charger
+        present = Fault.UNSUPPORTED_FIRMWARE in charger.faults
+        firmware = charger.info.firmware if charger.info is not None else None
+        for key in (UNKNOWN_FIRMWARE, UNSUPPORTED_FIRMWARE):
+            self._set(
+                key,
+                unit.subentry_id,
+                present=present and (key == UNKNOWN_FIRMWARE) == (firmware is None),
+                placeholders={
+                    "charger": unit.name,
+                    "address": str(charger.config.address),
+                    "firmware": firmware or "-",
+                },
+            )
 
     def _check_timeout(self, unit: ChargerUnit) -> None:
         """Note a fail-safe time-out that is longer than ordered."""

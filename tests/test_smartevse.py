@@ -1,0 +1,265 @@
+"""A polled SmartEVSE in Home Assistant: limits, access, mode, what it keeps."""
+
+from dataclasses import replace
+import sys
+
+from homeassistant.core import HomeAssistant
+from homeassistant.exceptions import HomeAssistantError, ServiceValidationError
+from homeassistant.helpers import device_registry as dr, entity_registry as er
+import pytest
+
+from custom_components.evse_bus.const import DOMAIN
+from custom_components.evse_bus.evse.model import Setting
+from tests.common import (
+    call,
+    entity_id,
+    get_entity,
+    running,
+    state_of,
+    wait_for_state,
+    wait_until,
+)
+from tests.test_coordinator import issue
+from tests.virtual import Car, SmartEvse
+
+DIALECTS = ("2.17", "2.20", "later")
+
+
+@pytest.fixture
+def short_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave a later box alone for less than 6.5 s; its time must run faster, too."""
+    charger = "custom_components.evse_bus.evse.smartevse.charger"
+    monkeypatch.setattr(sys.modules[charger], "QUIET", 0.65)
+
+
+def car() -> Car:
+    """Return a car that does at once what it is told."""
+    return Car(reaction=0.0, ramp=0.1)
+
+
+@pytest.mark.parametrize(
+    ("dialect", "firmware", "settings"),
+    [
+        ("2.17", "2.17", 3),
+        ("2.20", "2.20", len(Setting)),
+        ("later", "later than 2.20", len(Setting)),
+    ],
+)
+@pytest.mark.usefixtures("all_entities_enabled")
+async def test_what_a_dialect_has(
+    hass: HomeAssistant, dialect: str, firmware: str, settings: int
+) -> None:
+    box = SmartEvse(dialect)
+    async with running(hass, box) as (entry, _):
+        await get_entity(hass, "number", entry, "setting_minimum_current")
+        device = dr.async_get(hass).async_get_device_by_identifier(
+            (DOMAIN, f"smartevse{box.unit}"), "bus"
+        )
+        assert device.model == "SmartEVSE v2"
+        assert device.sw_version == firmware
+        keys = {
+            one.unique_id.removeprefix(f"smartevse{box.unit}_")
+            for one in er.async_entries_for_config_entry(er.async_get(hass), "bus")
+        }
+        assert sum(key.startswith("setting_") for key in keys) == settings
+        assert ("temperature" in keys) == (dialect == "later")
+        assert not {"shared_supply", "second_master"} & {
+            key.removeprefix("bus_") for key in keys
+        }
+        fail_safe = await get_entity(hass, "sensor", entry, "fail_safe")
+        assert state_of(hass, fail_safe) == "nothing"
+
+
+async def test_a_limit_is_what_the_car_is_offered(hass: HomeAssistant) -> None:
+    box = SmartEvse(car=car(), max_current=13)
+    async with running(hass, box, time_scale=4) as (entry, bus):
+        box.car.plug_in()
+        charging = await get_entity(hass, "binary_sensor", entry, "1_charging")
+        offered = await get_entity(hass, "sensor", entry, "offered_current")
+        limit = await get_entity(hass, "number", entry, "charging_current")
+        await wait_for_state(hass, charging, "on")
+        # It began with its own 13 A; the order is what was confirmed at first.
+        await wait_for_state(hass, offered, "6.0")
+        assert state_of(hass, limit) == "6.0"
+        # Its own maximum, although cable and wiring carry more.
+        assert hass.states.get(limit).attributes["max"] == 13.0
+        await call(hass, "number.set_value", limit, value=10.5)
+        await bus.wait_for_async(lambda: box.pilot_current == 10.5)
+        assert state_of(hass, offered) == "10.5"
+
+
+async def test_access_off_hides_whether_a_car_is_there(hass: HomeAssistant) -> None:
+    box = SmartEvse(car=car())
+    async with running(hass, box, time_scale=4) as (entry, _):
+        box.car.plug_in()
+        plugged = await get_entity(hass, "binary_sensor", entry, "1_plugged")
+        status = await get_entity(hass, "sensor", entry, "1_status")
+        allowed = await get_entity(hass, "switch", entry, "charging_allowed")
+        await wait_for_state(hass, status, "charging")
+        assert state_of(hass, plugged) == "on"
+
+        await call(hass, "switch.turn_off", allowed)
+        assert not box.access
+        assert not box.contactor
+        assert state_of(hass, allowed) == "off"
+        assert state_of(hass, plugged) == "unknown"
+        assert state_of(hass, status) == "unavailable"
+
+        await call(hass, "switch.turn_on", allowed)
+        assert box.access
+        assert state_of(hass, allowed) == "on"
+        await wait_for_state(hass, status, "charging")
+        await wait_for_state(hass, plugged, "on")
+
+
+async def test_somebody_turns_access_off_at_the_box(hass: HomeAssistant) -> None:
+    """The switch says what the box says, and nothing turns it on again."""
+    box = SmartEvse(settings={"switch": 1})
+    async with running(hass, box) as (entry, bus):
+        allowed = await get_entity(hass, "switch", entry, "charging_allowed")
+        limit = await get_entity(hass, "number", entry, "charging_current")
+        await call(hass, "switch.turn_on", allowed)
+        box.press_access()
+        await wait_for_state(hass, allowed, "off")
+        await call(hass, "number.set_value", limit, value=9)
+        polls = box.requests
+        await bus.wait_for_async(lambda: box.requests > polls + 10)
+        assert not box.access
+
+
+async def test_to_wait_for_current_is_no_problem(hass: HomeAssistant) -> None:
+    box = SmartEvse(car=car(), mode=1)
+    box.outlet.meter_leaves = 0.0
+    async with running(hass, box, time_scale=10) as (entry, _):
+        fault = await get_entity(hass, "sensor", entry, "fault")
+        problem = await get_entity(hass, "binary_sensor", entry, "problem")
+        await wait_for_state(hass, fault, "none")
+        box.car.plug_in()
+        await wait_for_state(hass, fault, "less_6a")
+        assert state_of(hass, problem) == "off"
+        assert hass.states.get(fault).attributes["codes"] == ["0x01"]
+
+        # What is a problem comes first.
+        box.outlet.meter_works = False
+        await wait_for_state(hass, fault, "no_comm")
+        assert state_of(hass, problem) == "on"
+        faults = hass.states.get(fault).attributes["faults"]
+        assert faults == ["no_comm", "less_6a"]
+
+
+# -- Mode ------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("short_quiet")
+@pytest.mark.parametrize("dialect", DIALECTS)
+async def test_the_mode_until_a_restart(hass: HomeAssistant, dialect: str) -> None:
+    box = SmartEvse(dialect, load_balance=1, mode=1)
+    async with running(hass, box, time_scale=10) as (entry, _):
+        mode = await get_entity(hass, "select", entry, "mode")
+        await wait_for_state(hass, mode, "smart")
+        await call(hass, "select.select_option", mode, option="solar")
+        assert box.outlet.settings["mode"] == 2
+        assert state_of(hass, mode) == "solar"
+        assert not box.eeprom_writes
+        with pytest.raises(ServiceValidationError):
+            await call(hass, "select.select_option", mode, option="lunar")
+
+
+async def test_a_mode_that_cannot_be_changed_says_why(hass: HomeAssistant) -> None:
+    """Such a box does not even answer; the error says what to set in its menu."""
+    async with running(hass, SmartEvse(mode=1)) as (entry, _):
+        mode = await get_entity(hass, "select", entry, "mode")
+        with pytest.raises(HomeAssistantError) as refused:
+            await call(hass, "select.select_option", mode, option="solar")
+        assert refused.value.translation_key == "not_available"
+        assert "Master in its menu" in str(refused.value)
+        assert state_of(hass, mode) == "smart"
+
+
+# -- What it keeps in its memory -------------------------------------------------
+
+
+async def test_settings_are_disabled_at_first(hass: HomeAssistant) -> None:
+    async with running(hass, SmartEvse("later")):
+
+        def settings() -> list[er.RegistryEntry]:
+            known = er.async_get(hass)
+            return [
+                one
+                for one in er.async_entries_for_config_entry(known, "bus")
+                if "_setting_" in one.unique_id
+            ]
+
+        await wait_until(hass, settings)
+        assert len(settings()) == len(Setting)
+        assert all(one.disabled_by for one in settings())
+
+
+@pytest.mark.usefixtures("all_entities_enabled")
+async def test_a_setting_is_written_once(hass: HomeAssistant) -> None:
+    box = SmartEvse("2.20", max_current=13)
+    async with running(hass, box) as (entry, bus):
+        highest = await get_entity(hass, "number", entry, "setting_maximum_current")
+        limit = await get_entity(hass, "number", entry, "charging_current")
+        allowed = await get_entity(hass, "switch", entry, "charging_allowed")
+        assert state_of(hass, highest) == "13"
+        # No more than the wiring carries.
+        assert hass.states.get(highest).attributes["max"] == 16
+        await call(hass, "switch.turn_off", allowed)
+        await call(hass, "number.set_value", highest, value=15.9)
+        assert box.outlet.settings["max_current"] == 15
+        assert state_of(hass, highest) == "15"
+        # Such a write opens access: it is closed again.
+        assert not box.access
+        await wait_for_state(hass, limit, lambda state: state.attributes["max"] == 15.0)
+        for absurd in (float("nan"), 17):
+            with pytest.raises(ServiceValidationError):
+                await call(hass, "number.set_value", highest, value=absurd)
+        polls = box.requests
+        await bus.wait_for_async(lambda: box.requests > polls + 3)
+        assert sum(box.eeprom_writes.values()) == 1
+
+
+@pytest.mark.usefixtures("all_entities_enabled", "short_quiet")
+async def test_signed_settings(hass: HomeAssistant) -> None:
+    box = SmartEvse("later")
+    async with running(hass, box, time_scale=10) as (entry, _):
+        start = await get_entity(hass, "number", entry, "setting_solar_start_current")
+        attributes = hass.states.get(start).attributes
+        assert (attributes["min"], attributes["max"]) == (-16, 16)
+        await call(hass, "number.set_value", start, value=-2.5)
+        # Down means: it starts with more import, as asked for or later.
+        assert state_of(hass, start) == "-3"
+
+
+@pytest.mark.usefixtures("all_entities_enabled")
+async def test_the_mode_it_starts_with(hass: HomeAssistant) -> None:
+    box = SmartEvse("2.20")
+    async with running(hass, box) as (entry, _):
+        start = await get_entity(hass, "select", entry, "setting_mode_at_start")
+        assert state_of(hass, start) == "normal"
+        await call(hass, "select.select_option", start, option="solar")
+        assert box.outlet.stored["mode"] == 2
+        assert state_of(hass, start) == "solar"
+        assert sum(box.eeprom_writes.values()) == 1
+
+
+# -- What is not as it should be -------------------------------------------------
+
+
+async def test_another_device_answers(hass: HomeAssistant) -> None:
+    box = SmartEvse()
+    dialect = box.controller.dialect
+    box.controller.dialect = replace(dialect, states=dict.fromkeys(dialect.states, 90))
+    async with running(hass, box) as (entry, _):
+        problem = await get_entity(hass, "binary_sensor", entry, "problem")
+        await wait_for_state(hass, problem, "on")
+        assert issue(hass, "unknown_firmware_smartevse0")
+        assert state_of(hass, entity_id(hass, "sensor", entry, "fault")) == (
+            "unsupported_firmware"
+        )
+        assert entity_id(hass, "sensor", entry, "1_status") is None
+        assert not box.writes
+        box.controller.dialect = dialect
+        await wait_for_state(hass, problem, "off")
+        assert not issue(hass, "unknown_firmware_smartevse0")
