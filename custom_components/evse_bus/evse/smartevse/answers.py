@@ -50,6 +50,7 @@ class Answer:
         except LineBusyError:
             return self._go_on()
         self._slave.answered(self._request)
+        self._slave.master.changed()
         return None
 
     def _others_can_make_room(self) -> bool:

@@ -103,6 +103,7 @@ class Master(Duty):
         self._supply = _checked(supply)
         self.updated()
         self._has_spoken.clear()
+        self.changed()
         self.hurry()
         if self._phase is _Phase.SPEAKING and self.slaves:
             with suppress(TimeoutError):

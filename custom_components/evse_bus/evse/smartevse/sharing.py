@@ -171,7 +171,9 @@ def next_values(
     for unit, share in shares.items():
         draw = draws[unit]
         most = draw.most(now)
-        if draw.may_draw and share > most:
+        if most == inf:
+            share = min(share, LOWEST)  # noqa: PLW2901 - what of it may be said now
+        elif draw.may_draw and share > most:
             more = int(min(free, share - most))
             free -= more
             share = int(most) + more  # noqa: PLW2901 - what of it may be said now

@@ -235,6 +235,9 @@ class SlaveSmartEvse(SmartEvseBox):
     @override
     def take(self, status: Status, now: float) -> None:
         super().take(status, now)
+        if self.configuration is None:
+            # Without it the limit is 6 A: a box that charges must not wait for it.
+            self._tend_soon(now)
         closed = status.raw_state in CHARGING
         if not closed:
             self.came = inf if now >= self._promised_until else self.came

@@ -1,0 +1,297 @@
+"""A simulated RS-485 line with SmartEVSE slaves and our master on it.
+
+The boxes are virtual ones, in simulated time; who overlaps on the wire is not heard.
+The witness is what the boxes offer with their contactors closed.
+"""
+
+import asyncio
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+import itertools
+from typing import Self, override
+
+from custom_components.evse_bus.evse.bus import Bus
+from custom_components.evse_bus.evse.errors import LineLostError
+from custom_components.evse_bus.evse.framing import LineSettings
+from custom_components.evse_bus.evse.line import Line
+from custom_components.evse_bus.evse.modbus import RtuFramer
+from custom_components.evse_bus.evse.model import CurrentLimit, Orders, Supply
+from custom_components.evse_bus.evse.smartevse.master import Master
+from custom_components.evse_bus.evse.smartevse.slave import (
+    SlaveConfig,
+    SlaveSmartEvse,
+)
+from custom_components.evse_bus.evse.smartevse.timing import TIMING
+from tests.evse.simulated import now
+from tests.virtual import Car, SmartEvseController
+from tests.virtual.smartevse_registers import DIALECTS
+
+SETTINGS = LineSettings(baudrate=9600)
+BYTE = SETTINGS.byte_time
+STEP = 0.02
+BROADCAST = bytes((0, 0x10, 0, 1))
+
+
+@dataclass
+class Box:
+    """A virtual slave, and what of the wire reaches it."""
+
+    controller: SmartEvseController
+    car: Car
+    deaf: bool = False
+    mute: bool = False
+    delay: float = 0.008
+    misses: Callable[[bytes], bool] = lambda _data: False
+    loses: Callable[[bytes], bool] = lambda _data: False
+
+    @property
+    def unit(self) -> int:
+        return self.controller.unit
+
+    @property
+    def offers(self) -> float:
+        """What a car may draw now, A."""
+        outlet = self.controller.outlet
+        return outlet.pilot_current if outlet.contactor else 0.0
+
+    @property
+    def state(self) -> str:
+        return self.controller.outlet.state
+
+
+@dataclass
+class Sent:
+    when: float
+    data: bytes
+
+    @property
+    def is_broadcast(self) -> bool:
+        return self.data.startswith(BROADCAST)
+
+    @property
+    def words(self) -> tuple[int, ...]:
+        """The values of a broadcast, 0.1 A."""
+        pairs = itertools.batched(self.data[7:-2], 2, strict=True)
+        return tuple(int.from_bytes(bytes(pair), "big") for pair in pairs)
+
+
+class Ether(Line):
+    """The wire: bytes take their time, and what overlaps is lost."""
+
+    def __init__(self) -> None:
+        super().__init__("simulated", SETTINGS)
+        self.boxes: dict[int, Box] = {}
+        self.sent: list[Sent] = []
+        self.refuse_open: Exception | None = None
+        self.busy_until = 0.0
+        self._open = False
+        self._lost_until = 0.0
+
+    @property
+    @override
+    def is_open(self) -> bool:
+        return self._open
+
+    @override
+    async def open(self) -> None:
+        if self.refuse_open is not None:
+            raise self.refuse_open
+        self._open = True
+        self.last_activity = now()
+
+    @override
+    async def close(self) -> None:
+        self._open = False
+
+    def unplug(self) -> None:
+        self._open = False
+        self.on_lost(LineLostError("unplugged"))
+
+    @override
+    def write(self, data: bytes, *, reply_may_equal: bool = False) -> float:
+        if not self._open:
+            raise LineLostError("not open")
+        begin, end = now(), now() + len(data) * BYTE
+        self.sent.append(Sent(begin, data))
+        self.last_activity = end
+        if begin < self.busy_until:
+            # It meets what somebody else is saying.
+            self._lost_until = self.busy_until = max(self.busy_until, end)
+            return end
+        self.busy_until = end
+        asyncio.get_running_loop().call_at(end, self._arrive, data, None)
+        return end
+
+    def say(self, data: bytes, speaker: Box | None = None) -> None:
+        """Let somebody else speak as soon as the line has been quiet for 6 ms."""
+        wait = self.busy_until + 0.0061 - now()
+        if wait > 0:
+            asyncio.get_running_loop().call_later(wait, self.say, data, speaker)
+            return
+        loop = asyncio.get_running_loop()
+        begin = now()
+        self.busy_until = begin + len(data) * BYTE
+        for index in range(len(data)):
+            at = begin + (index + 1) * BYTE
+            loop.call_at(at, self._hear, data[index : index + 1])
+        loop.call_at(self.busy_until, self._arrive, data, speaker)
+
+    def _hear(self, data: bytes) -> None:
+        if self._open and now() > self._lost_until:
+            self.last_activity = max(self.last_activity, now())
+            self.on_data(data)
+
+    def noise(self, data: bytes) -> None:
+        """Bytes out of nowhere, at our end only."""
+        self._hear(data)
+
+    def _arrive(self, data: bytes, speaker: Box | None) -> None:
+        """Bring a frame to all boxes but its speaker."""
+        if now() <= self._lost_until:
+            return
+        for box in self.boxes.values():
+            if box is speaker or box.deaf or (speaker is None and box.misses(data)):
+                continue
+            answer = box.controller.receive(data, now())
+            self._speak_for(box)
+            if answer is not None and not box.mute and not box.loses(answer):
+                asyncio.get_running_loop().call_later(box.delay, self.say, answer, box)
+
+    def _speak_for(self, box: Box) -> None:
+        sending = box.controller.sending
+        while sending:
+            data = sending.pop(0)
+            if not box.mute and not box.loses(data):
+                self.say(data, box)
+
+    def live(self) -> None:
+        """Let the boxes live until now."""
+        for box in tuple(self.boxes.values()):
+            box.controller.step(now())
+            self._speak_for(box)
+
+
+@dataclass
+class MasterScene:
+    """Our master, its slaves and their cars."""
+
+    units: tuple[int, ...] = (2, 3)
+    limit: float = 16.0
+    minimum: float = 6.0
+    current: float = 16.0
+    allowed: bool | None = True
+    maximum: int = 16
+    watch: bool = True
+    line: Ether = field(init=False)
+    bus: Bus = field(init=False)
+    master: Master = field(init=False)
+    most: float = field(init=False, default=0.0)
+    """Most that all boxes have offered at one moment, A."""
+    overshoot: float = field(init=False, default=0.0)
+    """By how much that was above the limit at worst, A."""
+
+    def __post_init__(self) -> None:
+        self.line = Ether()
+        self.new_bus()
+        self._life: asyncio.Task[None] | None = None
+        for unit in self.units:
+            self.plug_box(unit)
+            self.add(unit)
+
+    def new_bus(self) -> None:
+        """Home Assistant starts anew; the boxes have lived on."""
+        self.master = Master(Supply(limit=self.limit, minimum=self.minimum))
+        self.bus = Bus(self.line, RtuFramer(), TIMING, "simulated", duty=self.master)
+
+    def plug_box(self, unit: int, dialect: str = "2.17") -> Box:
+        car = Car(max_current=32.0)
+        settings = {"load_balance": unit, "max_current": self.maximum}
+        controller = SmartEvseController(
+            DIALECTS[dialect],  # type: ignore[index]
+            car,
+            cable=32,
+            settings=settings,
+        )
+        box = Box(controller, car)
+        self.line.boxes[unit] = box
+        return box
+
+    def make(self, unit: int, **orders: object) -> SlaveSmartEvse:
+        config = SlaveConfig(
+            key=str(unit),
+            name=f"slave {unit}",
+            address=unit,
+            installation_limit=32.0,
+        )
+        wish = {"limit": CurrentLimit(current=self.current), "allowed": self.allowed}
+        return SlaveSmartEvse(config, Orders(**(wish | orders)))  # type: ignore[arg-type]
+
+    def add(self, unit: int, **orders: object) -> SlaveSmartEvse:
+        slave = self.make(unit, **orders)
+        self.bus.add(slave)
+        return slave
+
+    def box(self, unit: int) -> Box:
+        return self.line.boxes[unit]
+
+    def slave(self, unit: int) -> SlaveSmartEvse:
+        slave = self.bus.chargers[str(unit)]
+        assert isinstance(slave, SlaveSmartEvse)
+        return slave
+
+    @property
+    def offers(self) -> float:
+        return sum(box.offers for box in self.line.boxes.values())
+
+    def broadcasts(self, since: float = 0.0) -> list[Sent]:
+        return [s for s in self.line.sent if s.is_broadcast and s.when >= since]
+
+    def gaps(self, since: float = 0.0) -> list[float]:
+        times = [sent.when for sent in self.broadcasts(since)]
+        return [b - a for a, b in itertools.pairwise(times)]
+
+    def frames(self, start: str, since: float = 0.0) -> list[str]:
+        """What we sent that begins like this, as hex."""
+        return [
+            sent.data.hex()
+            for sent in self.line.sent
+            if sent.data.hex().startswith(start) and sent.when >= since
+        ]
+
+    async def until(self, what: Callable[[], object], patience: float = 60.0) -> float:
+        """Wait for something; return how long it took."""
+        begin = now()
+        while not what():
+            assert now() - begin < patience, "it never happened"
+            await asyncio.sleep(STEP)
+        return now() - begin
+
+    async def charge(self, *units: int) -> None:
+        """Let cars come, and wait until they charge."""
+        for unit in units:
+            self.box(unit).car.plug_in()
+        await self.until(lambda: all(self.box(u).state == "C" for u in units))
+
+    async def _live(self) -> None:
+        while True:
+            self.line.live()
+            offers = self.offers
+            self.most = max(self.most, offers)
+            over = offers - self.master.supply.limit
+            self.overshoot = max(self.overshoot, over)
+            await asyncio.sleep(STEP)
+
+    async def __aenter__(self) -> Self:
+        self._life = asyncio.create_task(self._live())
+        await self.bus.start()
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
+        await self.bus.stop()
+        if self._life is not None:
+            self._life.cancel()
+            with suppress(asyncio.CancelledError):
+                await self._life
+        if exc[0] is None and self.watch:
+            assert self.overshoot <= 1e-6, f"{self.overshoot:g} A above the supply"

@@ -1,0 +1,249 @@
+"""The master's broadcast: its period, whatever else the bus does."""
+
+import asyncio
+from contextlib import suppress
+from random import Random
+
+import pytest
+
+from custom_components.evse_bus.evse.errors import EvseError, LineLostError
+from custom_components.evse_bus.evse.model import OrderChange, Setting, Supply
+from custom_components.evse_bus.evse.smartevse.master import (
+    LISTENING,
+    LOOKING,
+    PERIOD,
+    SLACK,
+)
+from custom_components.evse_bus.evse.smartevse.sharing import STOPS_ALONE
+from tests.evse.simulated import now, simulate
+from tests.evse.smartevse.ether import MasterScene, Sent
+
+GARBAGE = bytes(range(1, 40))
+
+
+def test_it_listens_then_looks_then_speaks() -> None:
+    async def scene() -> None:
+        scene = MasterScene()
+        begin = now()
+        async with scene:
+            await asyncio.sleep(LISTENING - 0.01)
+            assert scene.line.sent == []
+            await asyncio.sleep(LOOKING)
+            first = scene.broadcasts()[0]
+            before = [s for s in scene.line.sent if s.when < first.when]
+            # Status and settings of both, and nothing written.
+            assert len(before) == 10
+            assert {sent.data[1] for sent in before} == {4}
+            assert first.when - begin < LISTENING + 0.5
+
+    simulate(scene())
+
+
+def test_its_period_does_not_drift() -> None:
+    async def scene() -> None:
+        async with MasterScene() as scene:
+            await scene.until(lambda: len(scene.broadcasts()) > 1)
+            begin = scene.broadcasts()[-1].when
+            await asyncio.sleep(600)
+            gaps = scene.gaps(begin)
+            assert len(gaps) >= 299
+            assert max(gaps) <= PERIOD + SLACK
+            assert min(gaps) >= PERIOD - SLACK
+            last = scene.broadcasts()[-1].when
+            assert last - begin == pytest.approx(PERIOD * len(gaps), abs=SLACK)
+            assert scene.bus.wire.statistics.missed_deadlines == 0
+
+    simulate(scene())
+
+
+def test_no_gap_whatever_the_bus_does() -> None:
+    """Dead slaves, commands, requests, noise, boxes that come and go."""
+
+    async def scene() -> None:
+        dice = Random(1)  # noqa: S311 - the same each time
+        async with MasterScene(units=(2, 3, 4), limit=32.0) as scene:
+            await asyncio.sleep(6)
+            commands: set[asyncio.Task[None]] = set()
+
+            async def command() -> None:
+                change = OrderChange(current=float(dice.choice((0, 6, 10, 13))))
+                with suppress(EvseError):
+                    slave = scene.bus.chargers[dice.choice(list(scene.bus.chargers))]
+                    if dice.random() < 0.3:
+                        await slave.configure(
+                            Setting.MAXIMUM_CURRENT, dice.choice((10, 16))
+                        )
+                    else:
+                        await slave.change_orders(change)
+
+            for turn in range(400):
+                kind = dice.randrange(8)
+                box = scene.box(dice.choice((2, 3, 4)))
+                if kind == 0:
+                    commands.add(asyncio.create_task(command()))
+                elif kind == 1:
+                    box.mute = not box.mute
+                elif kind == 2:
+                    (box.car.leave if box.car.plugged else box.car.plug_in)()
+                elif kind == 3:
+                    scene.line.noise(GARBAGE[: dice.randrange(40)])
+                elif kind == 4:
+                    # Somebody's request, to and from nobody.
+                    scene.line.say(bytes.fromhex("0a0600020082a9d0"))
+                elif kind == 5 and turn % 3 == 0:
+                    gone = scene.bus.chargers.get("4")
+                    if gone is None:
+                        scene.add(4)
+                    else:
+                        await scene.bus.remove(gone)
+                elif kind == 6:
+                    await scene.master.change_supply(
+                        Supply(limit=dice.choice((20.0, 32.0)))
+                    )
+                    scene.overshoot = 0.0
+                await asyncio.sleep(dice.random())
+            scene.overshoot = 0.0
+            gaps = scene.gaps(now() - 150)
+            assert max(gaps) <= PERIOD + SLACK + 0.1
+            assert scene.bus.wire.statistics.timeouts > 10
+            for one in commands:
+                one.cancel()
+
+    simulate(scene())
+
+
+def test_a_line_that_others_keep_busy() -> None:
+    """A burst longer than the patience for silence: then again at once."""
+
+    async def scene() -> None:
+        async with MasterScene() as scene:
+            await asyncio.sleep(6)
+            planned = scene.master.slot.ready
+            await asyncio.sleep(planned - now() - 0.3)
+            end = now() + 1.5
+            while now() < end:
+                scene.line.noise(b"\x55")
+                await asyncio.sleep(0.004)
+            await asyncio.sleep(3)
+            after = [sent for sent in scene.broadcasts() if sent.when > planned]
+            assert after[0].when - end < 0.1
+            # The next one is where it was planned.
+            assert after[1].when == pytest.approx(planned + PERIOD, abs=SLACK)
+            assert max(scene.gaps()) < 5
+
+    simulate(scene())
+
+
+def test_a_port_that_is_back_soon() -> None:
+    """The slaves go on: what they charged with they are read back, and told."""
+
+    async def scene() -> None:
+        async with MasterScene() as scene:
+            await asyncio.sleep(4)
+            await scene.charge(2, 3)
+            await asyncio.sleep(6.7)
+            scene.line.unplug()
+            await asyncio.sleep(8)
+            assert [box.offers for box in scene.line.boxes.values()] == [8.0, 8.0]
+            words = [sent.words for sent in scene.broadcasts(now() - 14)]
+            assert set(words) == {(0, 80, 80, 0)}
+            assert max(scene.gaps()) < 5
+
+    simulate(scene())
+
+
+def test_a_port_that_is_lost_for_longer() -> None:
+    async def scene() -> None:
+        async with MasterScene() as scene:
+            await asyncio.sleep(4)
+            await scene.charge(2)
+            scene.line.refuse_open = LineLostError("gone")
+            scene.line.unplug()
+            await asyncio.sleep(STOPS_ALONE)
+            assert scene.offers == 0
+            scene.line.refuse_open = None
+            sent = len(scene.line.sent)
+            await scene.until(lambda: len(scene.line.sent) > sent)
+            back = scene.line.last_activity
+            await scene.until(lambda: scene.box(2).state == "C")
+            first = [one for one in scene.broadcasts() if one.when > back][0]
+            assert first.when - back < LOOKING
+            await asyncio.sleep(5)
+            assert scene.offers == 16
+
+    simulate(scene())
+
+
+def test_nothing_is_said_where_there_are_no_slaves() -> None:
+    async def scene() -> None:
+        async with MasterScene(units=()) as scene:
+            scene.plug_box(2)
+            await asyncio.sleep(10)
+            assert scene.line.sent == []
+            slave = scene.add(2)
+            await slave.wait_available()
+            await asyncio.sleep(2.5)
+            assert scene.broadcasts()
+            await scene.bus.remove(slave)
+            await asyncio.sleep(0.1)
+            silent: list[Sent] = list(scene.line.sent)
+            await asyncio.sleep(20)
+            assert scene.line.sent == silent
+
+    simulate(scene())
+
+
+def test_a_slave_taken_off_while_it_charges_still_counts() -> None:
+    """It goes on with 6 A for as long as it hears us; its own word ends that."""
+
+    async def scene() -> None:
+        async with MasterScene() as scene:
+            await asyncio.sleep(4)
+            await scene.charge(2, 3)
+            await asyncio.sleep(4)
+            await scene.bus.remove(scene.slave(3))
+            await asyncio.sleep(20)
+            assert scene.box(3).offers == 6
+            assert scene.box(2).offers == 10
+            scene.box(3).car.leave()
+            await asyncio.sleep(5)
+            assert scene.offers == scene.box(2).offers == 16
+
+    simulate(scene())
+
+
+def test_a_restart_does_not_disturb_who_charges() -> None:
+    """Killed without a goodbye, and back within what the boxes wait."""
+
+    async def scene() -> None:
+        async with MasterScene() as scene:
+            await asyncio.sleep(4)
+            await scene.charge(2, 3)
+            await asyncio.sleep(4)
+            await scene.bus.stop()
+            await asyncio.sleep(4)
+            scene.new_bus()
+            scene.add(2)
+            scene.add(3)
+            await scene.bus.start()
+            for _ in range(1000):
+                await asyncio.sleep(0.02)
+                offers = [box.offers for box in scene.line.boxes.values()]
+                assert offers == [8.0, 8.0]
+
+    simulate(scene())
+
+
+def test_without_us_all_stop() -> None:
+    async def scene() -> None:
+        async with MasterScene() as scene:
+            await asyncio.sleep(4)
+            await scene.charge(2, 3)
+            last = scene.broadcasts()[-1].when
+            await scene.bus.stop()
+            await scene.until(lambda: scene.offers == 0)
+            assert 9 < now() - last < 11.1
+            for box in scene.line.boxes.values():
+                assert box.controller.outlet.error & 2
+
+    simulate(scene())

@@ -1,0 +1,308 @@
+"""Sharing a supply: splits, and what boxes may be offering; pure."""
+
+from dataclasses import dataclass, field
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import pytest
+
+from custom_components.evse_bus.evse.smartevse.sharing import (
+    LOWEST,
+    STOPS_ALONE,
+    Claim,
+    Draw,
+    grant,
+    in_the_way,
+    next_values,
+    offered,
+    split,
+)
+
+
+def claims(*wishes: int) -> list[Claim]:
+    return [Claim(unit=2 + n, wish=wish, came=n) for n, wish in enumerate(wishes)]
+
+
+@pytest.mark.parametrize(
+    ("limit", "minimum", "wishes", "shares"),
+    [
+        (160, 60, (160,), (160,)),
+        (160, 60, (160, 160), (80, 80)),
+        # What one cannot use the other gets.
+        (160, 60, (60, 160), (60, 100)),
+        (250, 60, (100, 130, 320), (83, 83, 83)),
+        (320, 60, (60, 130, 320), (60, 130, 130)),
+        (400, 60, (60, 130, 320), (60, 130, 210)),
+        # First come, first served, where there is not enough.
+        (160, 60, (160, 160, 160), (80, 80, 0)),
+        (180, 60, (160, 160, 160), (60, 60, 60)),
+        (160, 100, (160, 160), (160, 0)),
+        # A wish below the minimum is no reason to give nothing.
+        (160, 80, (60, 160), (60, 100)),
+        (59, 60, (160,), (0,)),
+        (0, 60, (160,), (0,)),
+        (160, 60, (0, 160), (0, 160)),
+    ],
+)
+def test_split(
+    limit: int, minimum: int, wishes: tuple[int, ...], shares: tuple[int, ...]
+) -> None:
+    assert tuple(split(limit, minimum, claims(*wishes)).values()) == shares
+
+
+def test_what_nobody_can_stop_has_its_6_a_before_all() -> None:
+    gone = Claim(unit=2, wish=60, came=9, fixed=True)
+    stopping = Claim(unit=3, wish=0, came=9, fixed=True)
+    last = Claim(unit=4, wish=160)
+    assert split(160, 60, [gone, last]) == {2: 60, 4: 100}
+    assert split(190, 60, [gone, stopping, last]) == {2: 60, 3: 0, 4: 70}
+    assert split(160, 60, [gone, stopping, last]) == {2: 60, 3: 0, 4: 0}
+
+
+@given(
+    limit=st.integers(0, 900),
+    minimum=st.integers(60, 160),
+    wishes=st.lists(st.integers(0, 800), max_size=3),
+)
+def test_a_split_keeps_to_the_limit_and_to_the_wishes(
+    limit: int, minimum: int, wishes: list[int]
+) -> None:
+    shares = split(limit, minimum, claims(*wishes))
+    assert sum(shares.values()) <= limit
+    for claim in claims(*wishes):
+        share = shares[claim.unit]
+        assert share <= claim.wish
+        assert share == 0 or share >= min(minimum, claim.wish) >= LOWEST
+    rest = limit - sum(shares.values())
+    unsatisfied = [c for c in claims(*wishes) if LOWEST <= shares[c.unit] < c.wish]
+    # Less is left than there are boxes that could use it.
+    assert not unsatisfied or rest < len(unsatisfied)
+
+
+def test_nonsense_counts_as_what_a_box_makes_of_it() -> None:
+    assert [offered(value) for value in (0, 59, 60, 800, 801)] == [60, 60, 60, 800, 60]
+
+
+def test_a_draw_counts_everything_a_box_may_be_following() -> None:
+    draw = Draw()
+    draw.read(100, 0.0, closed=True)
+    draw.said(80, 1.0)
+    assert draw.most(1.0) == 100
+    draw.read(80, 1.2, closed=True)
+    assert draw.most(1.2) == 80
+    draw.said(130, 2.0)
+    assert draw.most(2.0) == 130
+    draw.read(80, 2.2, closed=True)
+    assert draw.most(2.2) == 80
+    draw.read(130, 2.2, closed=False)
+    assert draw.most(2.2) == 0
+
+
+def test_who_is_not_heard_may_still_hear() -> None:
+    draw = Draw()
+    draw.read(160, 0.0, closed=True)
+    for second in range(2, 30, 2):
+        draw.said(60, second)
+        most = 160 if second < STOPS_ALONE else 60
+        assert draw.most(second) == most
+    # Without a broadcast it has stopped.
+    assert draw.most(28 + STOPS_ALONE) == 0
+
+
+def test_nobody_knows_what_goes_on_before_the_first_word() -> None:
+    draw = Draw(unknown_until=12.0)
+    draw.said(60, 5.0)
+    assert draw.most(11.9) == float("inf")
+    assert draw.most(12.0) == 60
+    draw.asked(6.0)
+    assert draw.most(6.0) == 0
+
+
+def test_a_grant_counts_until_a_later_broadcast_was_surely_heard() -> None:
+    draw = Draw()
+    draw.read(160, 0.0, closed=False)
+    draw.granted(160, 1.0)
+    draw.said(80, 2.0)
+    assert draw.most(2.0) == 160
+    # 0 may be the memory of a box that was switched off and on before the grant.
+    draw.read(0, 2.1, closed=True)
+    assert draw.most(2.1) == 160
+    draw.said(80, 3.0)
+    draw.read(80, 3.1, closed=True)
+    assert draw.most(3.1) == 80
+
+
+def test_a_repeated_request_does_not_undo_its_grant() -> None:
+    draw = Draw()
+    draw.read(100, 0.0, closed=False)
+    draw.granted(100, 1.0)
+    draw.asked(1.1)
+    assert draw.most(1.1) == 100
+
+
+# -- The property ------------------------------------------------------------------
+
+
+@dataclass
+class Slave:
+    """What the firmware does with what it hears (PROTOCOLS.md, 3)."""
+
+    heard: int = 0
+    pilot: int = 0
+    closed: bool = False
+    in_b: bool = False
+    silence: float = 0.0
+
+    def broadcast(self, value: int) -> None:
+        self.heard = value
+        self.silence = 0.0
+        if self.closed or self.in_b:
+            self.pilot = offered(value)
+
+    def granted(self, value: int) -> None:
+        if value:
+            self.pilot = offered(value)
+            self.closed = True
+
+    def passes(self, seconds: float) -> None:
+        self.silence += seconds
+        if self.silence >= STOPS_ALONE - 1:
+            self.closed = False
+
+    @property
+    def offers(self) -> int:
+        return self.pilot if self.closed else 0
+
+
+@dataclass
+class World:
+    limit: int
+    minimum: int
+    slaves: dict[int, Slave]
+    wishes: dict[int, int]
+    draws: dict[int, Draw] = field(default_factory=dict)
+    now: float = 0.0
+    gone: set[int] = field(default_factory=set)
+
+    def __post_init__(self) -> None:
+        self.draws = {unit: Draw(unknown_until=STOPS_ALONE) for unit in self.slaves}
+
+    def shares(self, asking: int | None = None) -> dict[int, int]:
+        active = []
+        for unit, draw in self.draws.items():
+            wish = self.wishes[unit]
+            unreachable = unit in self.gone or wish < LOWEST
+            fixed = draw.may_draw and unreachable
+            if draw.may_draw or unit == asking:
+                wish = min(wish, LOWEST) if fixed else wish
+                active.append(Claim(unit=unit, wish=wish, came=unit, fixed=fixed))
+        return {u: 0 for u in self.draws} | split(self.limit, self.minimum, active)
+
+    def broadcast(self, hearing: set[int], asking: int | None = None) -> None:
+        values = next_values(self.limit, self.shares(asking), self.draws, self.now)
+        for unit, value in values.items():
+            self.draws[unit].said(value, self.now)
+            if unit in hearing:
+                self.slaves[unit].broadcast(value)
+
+    def read(self, unit: int) -> None:
+        if unit not in self.gone:
+            slave = self.slaves[unit]
+            self.draws[unit].read(slave.heard, self.now, closed=slave.closed)
+
+    def ask(self, unit: int, *, arrives: bool) -> None:
+        slave = self.slaves[unit]
+        if slave.closed or unit in self.gone:
+            return
+        self.draws[unit].asked(self.now)
+        share = self.shares(unit)[unit]
+        value = grant(self.limit, share, unit, self.draws, self.now)
+        if value:
+            self.draws[unit].granted(value, self.now)
+        if arrives:
+            slave.granted(value)
+
+    def passes(self, seconds: float) -> None:
+        self.now += seconds
+        for slave in self.slaves.values():
+            slave.passes(seconds)
+
+    @property
+    def offers(self) -> int:
+        return sum(slave.offers for slave in self.slaves.values())
+
+
+units = st.sampled_from((2, 3, 4))
+steps = st.one_of(
+    st.tuples(st.just("broadcast"), st.sets(units)),
+    st.tuples(st.just("read"), units),
+    st.tuples(st.just("ask"), units, st.booleans()),
+    st.tuples(st.just("end"), units),
+    st.tuples(st.just("b"), units),
+    st.tuples(st.just("wish"), units, st.sampled_from((0, 60, 77, 160, 320))),
+    st.tuples(st.just("gone"), units),
+    st.tuples(st.just("back"), units),
+    st.tuples(st.just("reset"), units),
+    st.tuples(st.just("wait"), st.sampled_from((0.1, 1.0, 2.0, 6.0, 11.5))),
+)
+
+
+@settings(max_examples=400, deadline=None)
+@given(
+    limit=st.integers(180, 400),
+    minimum=st.sampled_from((60, 80)),
+    before=st.tuples(*(st.sampled_from((0, 0, 60, 60)),) * 3),
+    story=st.lists(steps, max_size=60),
+)
+def test_boxes_never_offer_more_than_the_limit(
+    limit: int, minimum: int, before: tuple[int, int, int], story: list[tuple]
+) -> None:
+    """18 A are enough for the 6 A of those that nobody can stop."""
+    slaves = {
+        unit: Slave(heard=pilot, pilot=pilot, closed=pilot > 0)
+        for unit, pilot in zip((2, 3, 4), before, strict=True)
+    }
+    world = World(limit, minimum, slaves, dict.fromkeys(slaves, 320))
+    for what, *rest in story:
+        match what, *rest:
+            case "broadcast", hearing:
+                world.broadcast(hearing)
+            case "read", unit:
+                world.read(unit)
+            case "ask", unit, arrives:
+                world.ask(unit, arrives=arrives)
+            case "end", unit:
+                slaves[unit].closed = False
+            case "b", unit:
+                slaves[unit].in_b = not slaves[unit].in_b
+            case "wish", unit, wish:
+                world.wishes[unit] = wish
+            case "gone", unit:
+                world.gone.add(unit)
+            case "back", unit:
+                world.gone.discard(unit)
+            case "reset", unit:
+                slaves[unit] = world.slaves[unit] = Slave()
+            case "wait", seconds:
+                world.passes(seconds)
+        assert world.offers <= limit
+
+
+def test_first_others_go_down_then_one_goes_up() -> None:
+    slaves = {2: Slave(heard=160, pilot=160, closed=True), 3: Slave(heard=80)}
+    world = World(160, 60, slaves, {2: 160, 3: 160})
+    world.read(2)
+    world.read(3)
+    world.ask(3, arrives=True)
+    assert slaves[3].offers == 0
+    assert in_the_way(world.shares(3), world.draws, world.now) == [2]
+    # It misses the first: no room is believed before it is read back.
+    world.broadcast({3}, asking=3)
+    world.read(2)
+    assert grant(160, 80, 3, world.draws, world.now) == 0
+    world.broadcast({2, 3}, asking=3)
+    assert grant(160, 80, 3, world.draws, world.now) == 0
+    world.read(2)
+    assert grant(160, 80, 3, world.draws, world.now) == 80
+    world.ask(3, arrives=True)
+    assert [slave.offers for slave in slaves.values()] == [80, 80]

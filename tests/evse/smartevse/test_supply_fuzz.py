@@ -1,0 +1,156 @@
+"""Property: whatever happens on the bus, the boxes together keep to the supply.
+
+Requests, lost broadcasts and answers, orders, boxes that die and go on hearing, a
+lost port, a restart: the witness is what the boxes offer with closed contactors.
+"""
+
+import asyncio
+from contextlib import suppress
+from random import Random
+from typing import Literal
+
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from custom_components.evse_bus.evse.errors import EvseError
+from custom_components.evse_bus.evse.model import OrderChange
+from tests.evse.simulated import simulate
+from tests.evse.smartevse.ether import MasterScene
+
+UNITS = (2, 3, 4)
+
+type Act = tuple[str, int, float]
+
+acts = st.lists(
+    st.tuples(
+        st.sampled_from(
+            (
+                "come",
+                "come",
+                "leave",
+                "rest",
+                "ask",
+                "limit",
+                "off",
+                "on",
+                "deaf",
+                "mute",
+                "well",
+                "lossy",
+                "reset",
+                "press",
+                "unplug",
+                "again",
+                "remove",
+            )
+        ),
+        st.sampled_from(UNITS),
+        st.sampled_from((0.0, 0.05, 0.3, 1.0, 2.5, 7.0, 13.0)),
+    ),
+    max_size=14,
+)
+
+
+async def act(scene: MasterScene, what: str, unit: int, dice: Random) -> None:
+    box = scene.box(unit)
+    slave = scene.bus.chargers.get(str(unit))
+    if what == "come":
+        box.car.plug_in()
+    elif what == "leave":
+        box.car.leave()
+    elif what == "rest":
+        box.car.finish()
+    elif what == "ask":
+        box.car.request()
+    elif what in ("limit", "off", "on") and slave is not None:
+        change = {
+            "limit": OrderChange(current=dice.choice((0.0, 6.0, 9.3, 13.0, 16.0))),
+            "off": OrderChange(allowed=False),
+            "on": OrderChange(allowed=True),
+        }[what]
+        with suppress(EvseError):
+            async with asyncio.timeout(3):
+                await slave.change_orders(change)
+    elif what == "deaf":
+        box.deaf = True
+    elif what == "mute":
+        box.mute = True
+    elif what == "well":
+        box.deaf = box.mute = False
+        box.misses = box.loses = lambda _data: False
+    elif what == "lossy":
+        box.misses = box.loses = lambda _data: dice.random() < 0.4
+    elif what == "reset":
+        box.controller.power_cycle()
+    elif what == "press":
+        box.controller.outlet.set_access(not box.controller.outlet.access)
+    elif what == "unplug":
+        scene.line.unplug()
+    elif what == "again":
+        # Home Assistant is killed, and started again.
+        await scene.bus.stop()
+        scene.new_bus()
+        for one in UNITS:
+            scene.add(one)
+        await scene.bus.start()
+    elif what == "remove" and slave is not None:
+        await scene.bus.remove(slave)
+        await asyncio.sleep(dice.choice((0.0, 5.0)))
+        scene.add(unit)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    story=acts,
+    limit=st.sampled_from((18.0, 20.0, 32.0)),
+    minimum=st.sampled_from((6.0, 8.0)),
+    seed=st.integers(0, 1000),
+)
+def test_never_more_than_the_supply(
+    story: list[Act], limit: float, minimum: float, seed: int
+) -> None:
+    """18 A are 6 A for each of three: what nobody can stop still fits."""
+
+    async def scene() -> None:
+        dice = Random(seed)
+        scene = MasterScene(units=UNITS, limit=limit, minimum=minimum, maximum=32)
+        async with scene:
+            for what, unit, pause in story:
+                await act(scene, what, unit, dice)
+                await asyncio.sleep(pause)
+            # All is well again: those who ask get what there is.
+            for box in scene.line.boxes.values():
+                box.deaf = box.mute = False
+                box.misses = box.loses = lambda _data: False
+            await asyncio.sleep(10)
+
+    simulate(scene())
+
+
+type Lowering = Literal["heard", "missed"]
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    first=st.sampled_from((20.0, 32.0)),
+    then=st.sampled_from((18.0, 12.0, 6.0, 0.0)),
+    at=st.floats(0.0, 2.0),
+)
+def test_a_lower_supply_counts_at_once(first: float, then: float, at: float) -> None:
+    async def scene() -> None:
+        units = (2, 3)
+        scene = MasterScene(units=units, limit=first, maximum=32, watch=False)
+        async with scene:
+            await asyncio.sleep(4)
+            await scene.charge(*units)
+            await asyncio.sleep(6 + at)
+            supply = scene.master.supply
+            await scene.master.change_supply(type(supply)(limit=then))
+            # One broadcast, and a stop for each box that is too many.
+            await asyncio.sleep(1.0)
+            assert scene.offers <= then
+            scene.overshoot = 0.0
+            await asyncio.sleep(90)
+            assert scene.overshoot == 0.0
+
+    simulate(scene())
