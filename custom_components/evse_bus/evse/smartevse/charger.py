@@ -10,15 +10,14 @@ PROTOCOLS.md, 3.
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import ClassVar, Final, override
+from typing import Final, override
 
 from ..errors import (
-    DuplicateAddressError,
     NotConfirmedError,
     RefusedOrderError,
 )
-from ..exchange import Request, Talk
-from ..jobs import Later, Step
+from ..exchange import Talk
+from ..jobs import Later
 from ..model import (
     MINIMUM_CURRENT,
     ChargerConfig,
@@ -31,24 +30,21 @@ from ..model import (
 )
 from ..safety import Setpoint, clamp
 from ..schedule import Kind
-from ..turns import Turns, in_turns
-from .box import WRITES, SmartEvseBox
+from ..turns import Turns
+from .box import WRITES
 from .config import PolledConfig, polled_config
 from .dialects import MAPS, Dialect
 from .mode import mode_conversation
+from .polled import PolledBox
 from .registers import Status, tenths, write_current
 from .states import CHARGING, is_stopped, offered, state_of, tells_plug
-from .timing import LOOK_AGAIN, QUIET, SETTLING
+from .timing import LOOK_AGAIN, SETTLING
 
-COMMANDS_FIRST: Final = 0.05
-"""s"""
 _LOWEST: Final = Orders(limit=CurrentLimit(current=MINIMUM_CURRENT))
 
 
-class PolledSmartEvse(SmartEvseBox):
+class PolledSmartEvse(PolledBox):
     """One SmartEVSE that is polled."""
-
-    pauses_hurry: ClassVar = True
 
     def __init__(self, config: ChargerConfig, orders: Orders) -> None:
         """Take the set-up; the box is not known before it answers."""
@@ -61,8 +57,6 @@ class PolledSmartEvse(SmartEvseBox):
         self._looked_at = 0.0
         self._limit_paused = False
         """Our own 0 A has turned its access off; a higher limit gives it back."""
-        self._needs_quiet = False
-        self._last_request = 0.0
 
     @override
     def forget(self) -> None:
@@ -74,38 +68,6 @@ class PolledSmartEvse(SmartEvseBox):
         super().missed(now)
         # It may have been switched off and on again.
         self._written = None
-
-    # -- When ------------------------------------------------------------------------
-
-    @override
-    def turns(self, conversation: Callable[[Talk], Turns]) -> Step[None]:
-        # Nobody else has a deadline here, and one burst costs a later box one quiet.
-        return in_turns(partial(_in_one_go, conversation))
-
-    @property
-    @override
-    def exchanges_per_turn(self) -> int:
-        # Dialect (2), status, settings (2), access and current, both read back.
-        return 10
-
-    @override
-    def minimum_pause(self, now: float) -> float:
-        if self.dialect is not None:
-            self._needs_quiet = self.dialect is Dialect.LATER
-        if not self._needs_quiet:
-            return 0.0
-        # Any request counts, whoever it is for and whoever of us has sent it.
-        sent_at = self.bus.wire.sent_at if self.bus is not None else None
-        self._last_request = max(self._last_request, sent_at or 0.0)
-        return max(0.0, self._last_request + QUIET - now)
-
-    @override
-    def plan(self, now: float) -> None:
-        super().plan(now)
-        # A little after the quiet: a command that waited for its end goes first.
-        quiet = now + self.minimum_pause(now) + COMMANDS_FIRST
-        if self._needs_quiet:
-            self.slot.ready = self.slot.due = max(self.slot.ready, quiet)
 
     # -- What it says ----------------------------------------------------------------
 
@@ -296,12 +258,8 @@ class PolledSmartEvse(SmartEvseBox):
     async def _impose(self, orders: Orders, change: OrderChange, talk: Talk) -> Turns:
         token = self.begin()
         try:
-            async for pause in self.reach(talk):
+            async for pause in self._prepare(talk, change):
                 yield pause
-            if self.configuration is None and change.allowed is not False:
-                # Without its own limits it would get 6 A first.
-                async for pause in self.read_configuration(talk):
-                    yield pause
             if clamp(self.target(change), self.limits).paused:
                 if self._must_pause(change):
                     ours = orders.allowed is not False
@@ -312,6 +270,20 @@ class PolledSmartEvse(SmartEvseBox):
                 yield pause
         finally:
             self.end(token)
+
+    async def _prepare(self, talk: Talk, change: OrderChange) -> Turns:
+        """See how the box is now; the user's pause goes out sooner."""
+        async for pause in self.reach(talk):
+            yield pause
+        if change.allowed is False:
+            return
+        async for pause in self.see(talk):
+            yield pause
+        yield 0.0
+        if self.configuration is None:
+            # Without its own limits it would get 6 A first.
+            async for pause in self.read_configuration(talk):
+                yield pause
 
     def _must_pause(self, change: OrderChange) -> bool:
         """Return whether a pause has to be said: the user's always, at once."""
@@ -366,28 +338,6 @@ class PolledSmartEvse(SmartEvseBox):
         conversation = mode_conversation(self, value)
         await self.run(self.turns(conversation), persistence=Persistence.REPEATABLE)
 
-    # -- Who else is there -------------------------------------------------------------
-
-    @override
-    async def write(self, talk: Talk, request: Request, register: int) -> bool | None:
-        self._check_alone()
-        return await super().write(talk, request, register)
-
-    def _check_alone(self) -> None:
-        """Raise DuplicateAddressError where a write would reach others too.
-
-        2.17 without load balancing has the address at which all others listen.
-        """
-        others = self.bus is not None and len(self.bus.chargers) > 1
-        shared = self.config.address == 0 and others
-        self.tell(Fault.DUPLICATE_ADDRESS, present=shared)
-        if shared:
-            message = (
-                f"{self.config.name} has address 0, at which every SmartEVSE listens: "
-                "nothing is written while others are on its bus"
-            )
-            raise DuplicateAddressError(message)
-
     # -- The end ---------------------------------------------------------------------
 
     @override
@@ -398,13 +348,6 @@ class PolledSmartEvse(SmartEvseBox):
                 persistence=Persistence.STANDING,
                 kind=Kind.PAUSE,
             )
-
-
-async def _in_one_go(conversation: Callable[[Talk], Turns], talk: Talk) -> Turns:
-    """Leave the pauses out that are only there to let others speak."""
-    async for pause in conversation(talk):
-        if pause > 0:
-            yield pause
 
 
 __all__ = ["PolledConfig", "PolledSmartEvse"]

@@ -1,0 +1,103 @@
+"""How a SmartEVSE that is polled may be spoken to: when, in one go, and alone.
+
+A later box needs quiet: any request on the line, whoever it is for, holds its own 2 s
+cycle up for 4 s; without it no new current counts, and after 10 s it stops with
+NO_COMM. So all that is to be said goes in one burst, and then there is quiet. Only a
+pause does not wait for its end. PROTOCOLS.md, 3.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import ClassVar, Final, override
+
+from ..errors import DuplicateAddressError, LineBusyError
+from ..exchange import Request, Talk
+from ..jobs import Later, Step
+from ..model import ChargerConfig, Fault, Orders
+from ..turns import Turns, in_turns
+from .box import SmartEvseBox
+from .dialects import Dialect
+from .timing import QUIET
+
+COMMANDS_FIRST: Final = 0.05
+"""A poll comes so much later than the end of the quiet, s."""
+
+
+class PolledBox(SmartEvseBox):
+    """One SmartEVSE that has no master, or is its own."""
+
+    pauses_hurry: ClassVar = True
+
+    def __init__(self, config: ChargerConfig, orders: Orders) -> None:
+        """Take the set-up; the box is not known before it answers."""
+        super().__init__(config, orders)
+        self._needs_quiet = False
+        self._last_request = 0.0
+
+    # -- When ------------------------------------------------------------------------
+
+    @override
+    def turns(self, conversation: Callable[[Talk], Turns]) -> Step[None]:
+        # Nobody else has a deadline here, and one burst costs a later box one quiet.
+        return in_turns(partial(_in_one_go, conversation))
+
+    @property
+    @override
+    def exchanges_per_turn(self) -> int:
+        # Dialect (2), status, settings (2), access and current, both read back.
+        return 10
+
+    @override
+    def minimum_pause(self, now: float) -> float:
+        if self.dialect is not None:
+            self._needs_quiet = self.dialect is Dialect.LATER
+        if not self._needs_quiet:
+            return 0.0
+        # Any request counts, whoever it is for and whoever of us has sent it.
+        sent_at = self.bus.wire.sent_at if self.bus is not None else None
+        self._last_request = max(self._last_request, sent_at or 0.0)
+        return max(0.0, self._last_request + QUIET - now)
+
+    @override
+    def plan(self, now: float) -> None:
+        super().plan(now)
+        # A little after the quiet: a command that waited for its end goes first.
+        quiet = now + self.minimum_pause(now) + COMMANDS_FIRST
+        if self._needs_quiet:
+            self.slot.ready = self.slot.due = max(self.slot.ready, quiet)
+
+    @override
+    async def poll(self, talk: Talk) -> Later[None] | None:
+        if self.minimum_pause(talk.now) > 0:
+            message = f"{self.config.name} is to be left alone: others have asked"
+            raise LineBusyError(message)
+        return await super().poll(talk)
+
+    # -- Who else is there -------------------------------------------------------------
+
+    @override
+    async def write(self, talk: Talk, request: Request, register: int) -> bool | None:
+        self._check_alone()
+        return await super().write(talk, request, register)
+
+    def _check_alone(self) -> None:
+        """Raise DuplicateAddressError where a write would reach others too.
+
+        2.17 without load balancing has the address at which all others listen.
+        """
+        others = self.bus is not None and len(self.bus.chargers) > 1
+        shared = self.config.address == 0 and others
+        self.tell(Fault.DUPLICATE_ADDRESS, present=shared)
+        if shared:
+            message = (
+                f"{self.config.name} has address 0, at which every SmartEVSE listens: "
+                "nothing is written while others are on its bus"
+            )
+            raise DuplicateAddressError(message)
+
+
+async def _in_one_go(conversation: Callable[[Talk], Turns], talk: Talk) -> Turns:
+    """Leave the pauses out that are only there to let others speak."""
+    async for pause in conversation(talk):
+        if pause > 0:
+            yield pause

@@ -1,0 +1,476 @@
+"""A polled SmartEVSE in all dialects: what it is told, and what is believed."""
+
+import asyncio
+
+import pytest
+
+from custom_components.evse_bus.evse.errors import (
+    DuplicateAddressError,
+    EvseError,
+    NotConfirmedError,
+    RefusedOrderError,
+)
+from custom_components.evse_bus.evse.model import (
+    Capability,
+    Fault,
+    Mode,
+    OrderChange,
+    Status,
+)
+from custom_components.evse_bus.evse.smartevse import POLLED
+from custom_components.evse_bus.evse.smartevse.dialects import Dialect
+from tests.evse.simulated import now, simulate
+
+from .polled import ALL, LATER, OLDER, V2_17, V2_20, PolledScene, play
+
+each = pytest.mark.parametrize("dialect", ALL)
+older = pytest.mark.parametrize("dialect", OLDER)
+
+
+@each
+def test_the_dialect_is_found_by_reading(dialect: Dialect) -> None:
+    async def acts(scene: PolledScene) -> None:
+        assert scene.charger.dialect is dialect
+
+    scene = play(PolledScene(dialect), acts)
+    first = scene.writes()[0].when
+    before = [sent for sent in scene.line.sent if sent.when < first]
+    # Dialect, status and both halves of the settings come before any write.
+    assert len(before) >= 4
+
+
+@each
+def test_no_car(dialect: Dialect) -> None:
+    async def acts(scene: PolledScene) -> None:
+        assert scene.connector.status is Status.AVAILABLE
+        assert scene.connector.raw_state == "A"
+        assert scene.connector.plugged is False
+        assert scene.connector.charging is False
+        assert scene.reading.allowed is True
+        assert scene.reading.offered_current is None
+        assert scene.reading.maximum_current == 16
+        assert scene.reading.mode is Mode.NORMAL
+        has = Capability.TEMPERATURE in scene.charger.capabilities
+        assert has == (dialect is LATER)
+        assert scene.reading.temperature == (20 if dialect is LATER else None)
+
+    play(PolledScene(dialect), acts)
+
+
+@each
+def test_a_car_charges_within_the_order(dialect: Dialect) -> None:
+    async def acts(scene: PolledScene) -> None:
+        await scene.charge()
+        await scene.polled(4)
+        assert scene.box.offers == 10
+        assert scene.connector.status is Status.CHARGING
+        assert scene.connector.raw_state == "C"
+        assert scene.connector.plugged is True
+        assert scene.connector.charging is True
+        assert scene.reading.offered_current == 10
+        assert scene.charger.faults == frozenset()
+
+    play(PolledScene(dialect), acts)
+
+
+@each
+def test_before_a_car_comes_it_is_told_6_a(dialect: Dialect) -> None:
+    """The cable that comes is not known, and the override beats its coding."""
+
+    async def acts(scene: PolledScene) -> None:
+        await scene.polled(1)
+        assert scene.currents() == [60]
+        scene.outlet.cable = 13
+        await scene.charge()
+        await scene.polled(4)
+        assert scene.box.offers == 13
+
+    scene = play(PolledScene(dialect, current=32, maximum=32, cable=32), acts)
+    assert max(scene.currents()) <= 130
+
+
+@each
+@pytest.mark.parametrize("amperes", [7.3, 12.0])
+def test_a_limit_is_read_back_before_it_is_believed(
+    dialect: Dialect, amperes: float
+) -> None:
+    async def acts(scene: PolledScene) -> None:
+        await scene.charge()
+        await scene.polled(4)
+        began = now()
+        await scene.charger.change_orders(OrderChange(current=amperes))
+        assert scene.box.offers == amperes
+        assert scene.reading.offered_current == amperes
+        assert now() - began < (14 if dialect is LATER else 3.5)
+
+    play(PolledScene(dialect), acts)
+
+
+@each
+def test_off_is_off_and_stays_so(dialect: Dialect) -> None:
+    async def acts(scene: PolledScene) -> None:
+        await scene.charge()
+        began = now()
+        await scene.charger.change_orders(OrderChange(allowed=False))
+        # A pause waits for no quiet.
+        assert now() - began < 0.5
+        assert not scene.outlet.access
+        await scene.until(lambda: not scene.box.controller.outlet.contactor, 7)
+        # A limit starts nobody's car.
+        await scene.charger.change_orders(OrderChange(current=16))
+        await scene.polled(3)
+        assert scene.box.offers == 0
+        assert scene.accesses() == [0]
+        assert scene.reading.allowed is False
+        assert scene.reading.offered_current == 0
+
+    play(PolledScene(dialect), acts)
+
+
+@older
+def test_without_access_an_older_box_hides_the_car(dialect: Dialect) -> None:
+    async def acts(scene: PolledScene) -> None:
+        await scene.charge()
+        await scene.charger.change_orders(OrderChange(allowed=False))
+        assert scene.connector.raw_state == "A"
+        assert scene.connector.plugged is None
+        assert scene.connector.status is Status.UNAVAILABLE
+        await scene.charger.change_orders(OrderChange(allowed=True))
+        assert scene.connector.plugged is not False
+        await scene.until(lambda: scene.box.state == "C")
+
+    play(PolledScene(dialect), acts)
+
+
+def test_without_access_a_later_box_still_tells_of_the_car() -> None:
+    async def acts(scene: PolledScene) -> None:
+        await scene.charge()
+        await scene.charger.change_orders(OrderChange(allowed=False))
+        assert scene.connector.raw_state == "C1"
+        assert scene.connector.charging is None
+        await scene.polled(2)
+        assert scene.connector.raw_state == "B1"
+        assert scene.connector.plugged is True
+        assert scene.connector.charging is False
+        assert scene.connector.status is Status.SUSPENDED_EVSE
+
+    play(PolledScene(LATER), acts)
+
+
+@each
+def test_on_again(dialect: Dialect) -> None:
+    async def acts(scene: PolledScene) -> None:
+        await scene.polled(1)
+        assert scene.accesses() == [0]
+        scene.car.plug_in()
+        await scene.polled(2)
+        assert scene.box.offers == 0
+        await scene.charger.change_orders(OrderChange(allowed=True))
+        assert scene.outlet.access
+        await scene.until(lambda: scene.box.offers == 10)
+
+    play(PolledScene(dialect, allowed=False), acts)
+
+
+@each
+def test_a_limit_of_0_a_is_a_pause_that_a_limit_ends(dialect: Dialect) -> None:
+    async def acts(scene: PolledScene) -> None:
+        await scene.charge()
+        await scene.charger.change_orders(OrderChange(current=0))
+        await scene.until(lambda: scene.box.offers == 0, 7)
+        await scene.polled(2)
+        assert scene.accesses() == [0]
+        await scene.charger.change_orders(OrderChange(current=8))
+        assert scene.accesses() == [0, 1]
+        await scene.until(lambda: scene.box.offers == 8)
+
+    scene = play(PolledScene(dialect), acts)
+    assert 0 not in scene.currents()
+
+
+@each
+def test_a_limit_gives_nothing_back_that_it_did_not_take(dialect: Dialect) -> None:
+    """Access was off before the limit was 0 A: somebody said no at the box."""
+
+    async def acts(scene: PolledScene) -> None:
+        scene.box.controller.outlet.set_access(False)
+        await scene.polled(2)
+        await scene.charger.change_orders(OrderChange(current=0))
+        await scene.charger.change_orders(OrderChange(current=10))
+        await scene.polled(2)
+        assert not scene.outlet.access
+        assert 1 not in scene.accesses()
+
+    play(PolledScene(dialect), acts)
+
+
+@each
+def test_the_users_no_outlives_a_limit_of_0_a(dialect: Dialect) -> None:
+    async def acts(scene: PolledScene) -> None:
+        await scene.charger.change_orders(OrderChange(current=0))
+        await scene.charger.change_orders(OrderChange(allowed=False))
+        await scene.charger.change_orders(OrderChange(current=10))
+        await scene.polled(2)
+        assert 1 not in scene.accesses()
+
+    play(PolledScene(dialect), acts)
+
+
+@each
+def test_access_opened_at_the_box_is_closed_again(dialect: Dialect) -> None:
+    async def acts(scene: PolledScene) -> None:
+        await scene.polled(1)
+        scene.car.plug_in()
+        scene.outlet.access = True
+        await scene.polled(2)
+        assert not scene.outlet.access
+        await scene.until(lambda: scene.box.offers == 0, 7)
+
+    play(PolledScene(dialect, allowed=False), acts)
+
+
+@each
+def test_no_said_at_the_box_is_respected(dialect: Dialect) -> None:
+    async def acts(scene: PolledScene) -> None:
+        await scene.charge()
+        scene.box.controller.outlet.set_access(False)
+        await scene.polled(3)
+        assert not scene.outlet.access
+        assert scene.accesses() == []
+        assert scene.reading.allowed is False
+
+    play(PolledScene(dialect, allowed=True), acts)
+
+
+@each
+def test_a_box_that_falls_back_is_told_again(dialect: Dialect) -> None:
+    """A write of 0 by somebody else takes the override off."""
+
+    async def acts(scene: PolledScene) -> None:
+        await scene.charge()
+        await scene.polled(4)
+        scene.outlet.override = 0
+        await scene.until(lambda: scene.outlet.pilot_current > 10)
+        took = await scene.until(lambda: scene.box.offers == 10)
+        assert took < (14 if dialect is LATER else 7)
+        assert scene.charger.statistics.reasserted >= 1
+
+    play(PolledScene(dialect), acts)
+
+
+@each
+def test_a_short_power_failure(dialect: Dialect) -> None:
+    async def acts(scene: PolledScene) -> None:
+        await scene.charge()
+        await scene.polled(4)
+        scene.box.controller.power_cycle()
+        await scene.polled(2)
+        await scene.until(lambda: scene.box.offers == 10)
+        await scene.polled(2)
+        assert scene.box.offers == 10
+        assert scene.charger.faults == frozenset()
+
+    play(PolledScene(dialect), acts)
+
+
+def test_a_firmware_without_the_override() -> None:
+    """It says no, and means it: the limit is not taken, and that is said."""
+
+    async def acts(scene: PolledScene) -> None:
+        scene.car.plug_in()
+        await scene.until(lambda: Fault.LIMIT_NOT_TAKEN in scene.charger.faults)
+        with pytest.raises(NotConfirmedError):
+            await scene.charger.change_orders(OrderChange(current=8))
+        await scene.charger.change_orders(OrderChange(allowed=False))
+        assert scene.box.offers == 0
+        assert Fault.LIMIT_NOT_TAKEN not in scene.charger.faults
+
+    play(PolledScene(V2_17, override_works=False), acts)
+
+
+@each
+def test_a_box_that_ignores_the_access_bit(dialect: Dialect) -> None:
+    async def acts(scene: PolledScene) -> None:
+        await scene.charge()
+        scene.box.controller.ignore_access = True
+        with pytest.raises(NotConfirmedError):
+            await scene.charger.change_orders(OrderChange(allowed=False))
+        assert Fault.LIMIT_NOT_TAKEN in scene.charger.faults
+        scene.box.controller.ignore_access = False
+        # The order stands: the next poll sees to it.
+        await scene.polled(3)
+        assert not scene.outlet.access
+        assert Fault.LIMIT_NOT_TAKEN not in scene.charger.faults
+
+    play(PolledScene(dialect), acts)
+
+
+@each
+def test_lost_answers(dialect: Dialect) -> None:
+    """A write whose answer is lost counts when it is read back."""
+
+    async def acts(scene: PolledScene) -> None:
+        await scene.charge()
+        await scene.polled(4)
+        lost: list[bytes] = []
+
+        def lose(data: bytes) -> bool:
+            if data[1] == 0x10 and len(lost) < 2:
+                lost.append(data)
+                return True
+            return False
+
+        scene.box.loses = lose
+        await scene.charger.change_orders(OrderChange(current=8))
+        assert scene.box.offers == 8
+        await scene.charger.change_orders(OrderChange(allowed=False))
+        assert not scene.outlet.access
+        assert len(lost) == 2
+
+    play(PolledScene(dialect), acts)
+
+
+def test_an_error_is_a_fault() -> None:
+    async def acts(scene: PolledScene) -> None:
+        await scene.charge()
+        scene.outlet.temperature = 70
+        await scene.until(lambda: Fault.TEMP_HIGH in scene.charger.faults)
+        assert scene.connector.status is Status.FAULTED
+        assert scene.connector.plugged is None
+        assert scene.reading.fault_codes == ("0x04",)
+
+    play(PolledScene(V2_17), acts)
+
+
+def test_the_serial_number_is_checked() -> None:
+    async def run_wrong() -> PolledScene:
+        scene = PolledScene(LATER, expected="815")
+        async with scene:
+            await scene.until(lambda: Fault.WRONG_CHARGER in scene.charger.faults)
+            await asyncio.sleep(30)
+            with pytest.raises(EvseError):
+                await scene.charger.change_orders(OrderChange(allowed=False))
+        return scene
+
+    scene = simulate(run_wrong())
+    assert scene.writes() == []
+    assert scene.charger.reading is None
+
+
+def test_another_box_in_its_place() -> None:
+    async def acts(scene: PolledScene) -> None:
+        scene.serial = 815
+        scene.replace_box(LATER)
+        since = now()
+        await scene.until(lambda: Fault.WRONG_CHARGER in scene.charger.faults)
+        await asyncio.sleep(60)
+        assert scene.writes(since=since) == []
+
+    play(PolledScene(LATER), acts)
+
+
+def test_another_firmware_is_learnt_anew() -> None:
+    async def acts(scene: PolledScene) -> None:
+        scene.replace_box(LATER)
+        scene.dialect = LATER
+        await scene.until(lambda: scene.charger.dialect is LATER)
+        await scene.charge()
+        await scene.polled(3)
+        assert scene.box.offers == 10
+
+    play(PolledScene(V2_20), acts)
+
+
+def test_at_address_0_nobody_else_may_be_there() -> None:
+    async def acts(scene: PolledScene) -> None:
+        since = now()
+        scene.bus.add(PolledScene(LATER).make_charger("other"))
+        with pytest.raises(DuplicateAddressError):
+            await scene.charger.change_orders(OrderChange(allowed=False))
+        assert scene.writes(since=since) == []
+        assert Fault.DUPLICATE_ADDRESS in scene.charger.faults
+
+    play(PolledScene(V2_17), acts)
+
+
+@each
+@pytest.mark.parametrize("stop", [True, False])
+def test_farewell(dialect: Dialect, *, stop: bool) -> None:
+    async def acts(scene: PolledScene) -> None:
+        await scene.charge()
+        before = scene.charger.orders
+        await scene.charger.farewell()
+        assert scene.outlet.access is not stop
+        assert scene.charger.orders == before
+
+    play(PolledScene(dialect, stop_on_shutdown=stop), acts)
+
+
+@each
+def test_an_order_that_nobody_renews(dialect: Dialect) -> None:
+    async def acts(scene: PolledScene) -> None:
+        await scene.charge()
+        await scene.until(lambda: scene.box.offers == 10)
+        await scene.until(lambda: scene.box.offers == 6, 90)
+        assert Capability.FAIL_SAFE_CURRENT in scene.charger.capabilities
+
+    play(PolledScene(dialect, lifetime=40.0), acts)
+
+
+@each
+def test_below_its_own_minimum_is_a_pause(dialect: Dialect) -> None:
+    async def acts(scene: PolledScene) -> None:
+        assert scene.charger.limits.minimum == 8
+        with pytest.raises(RefusedOrderError):
+            await scene.charger.change_orders(OrderChange(current=7))
+
+    play(PolledScene(dialect, minimum=8), acts)
+
+
+@older
+def test_poll_interval(dialect: Dialect) -> None:
+    async def acts(scene: PolledScene) -> None:
+        await asyncio.sleep(10)
+        since = now()
+        await asyncio.sleep(100)
+        reads = [one for one in scene.line.sent if one.when >= since]
+        assert 45 <= len(reads) <= 51
+
+    play(PolledScene(dialect), acts)
+
+
+@each
+def test_nothing_is_written_without_need(dialect: Dialect) -> None:
+    async def acts(scene: PolledScene) -> None:
+        await scene.charge()
+        await scene.polled(5)
+        since = now()
+        await asyncio.sleep(240)
+        assert scene.writes(since=since) == []
+        assert not scene.box.controller.eeprom_writes
+
+    play(PolledScene(dialect), acts)
+
+
+@each
+def test_scan(dialect: Dialect) -> None:
+    async def acts(scene: PolledScene) -> None:
+        shares: list[float] = []
+        since = now()
+        report = await POLLED.scan(
+            scene.bus, scene.charger.config, scene.charger.orders, shares.append
+        )
+        (found,) = report.found
+        assert found.address == scene.box.unit == (0 if dialect is V2_17 else 1)
+        assert found.info.firmware is not None
+        assert found.info.firmware.startswith("2.") == (dialect is not LATER)
+        assert found.serial == ("4711" if dialect is LATER else None)
+        assert found.maximum_current == 16
+        assert shares[0] == 0
+        assert shares[-1] == 1
+        assert report.duplicates == ()
+        assert all(
+            sent.data[1] in (3, 4) for sent in scene.line.sent if sent.when > since
+        )
+
+    play(PolledScene(dialect), acts)
