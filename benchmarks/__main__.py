@@ -7,14 +7,30 @@ import sys
 import traceback
 from typing import Final
 
-from . import abl_scan, evbox_bus, exchange_cpu, home_assistant, set_value
+from . import (
+    abl_scan,
+    evbox_bus,
+    exchange_cpu,
+    home_assistant,
+    set_value,
+    smartevse_master,
+    smartevse_polled,
+)
 from .figures import Figure, results, table
 from .machine import OUTPUT, machine
 from .progress import say
 
 BENCHMARKS: Final = {
     one.NAME: one
-    for one in (abl_scan, evbox_bus, set_value, exchange_cpu, home_assistant)
+    for one in (
+        abl_scan,
+        evbox_bus,
+        set_value,
+        exchange_cpu,
+        home_assistant,
+        smartevse_master,
+        smartevse_polled,
+    )
 }
 
 

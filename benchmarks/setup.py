@@ -9,13 +9,24 @@ from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.charger import Charger
 from custom_components.evse_bus.evse.evbox import PROTOCOL as EVBOX, EvboxConfig
 from custom_components.evse_bus.evse.framing import LineSettings
-from custom_components.evse_bus.evse.model import CurrentLimit, Orders
+from custom_components.evse_bus.evse.model import (
+    CurrentLimit,
+    Orders,
+    Supply,
+)
+from custom_components.evse_bus.evse.smartevse import (
+    MASTER,
+    POLLED,
+    PolledConfig,
+    SlaveConfig,
+)
 
 from .witness import Heard
 
 ABL_LIMIT: Final = 16.0
 EVBOX_LIMIT: Final = 320.0
 """A for a ChargePoint of 20 modules."""
+SMARTEVSE_LIMIT: Final = 16.0
 SETTLED_AFTER: Final = 1.5
 """So long without a time-out means that all boxes have been found out about, s."""
 SETTLES_WITHIN: Final = 60.0
@@ -64,6 +75,37 @@ def evbox_bus(url: str, serials: Iterable[int], *, period: float, timeout: int) 
         orders = Orders(limit=limit, fail_safe=limit, fail_safe_timeout=timeout)
         bus.add(EVBOX.charger(config, orders))
     return bus
+
+
+def smartevse_bus(url: str, unit: int) -> Bus:
+    """Return a bus with one SmartEVSE that is polled."""
+    bus = POLLED.bus(url)
+    config = PolledConfig(
+        key=f"smartevse-{unit}",
+        name=f"SmartEVSE {unit}",
+        address=unit,
+        installation_limit=SMARTEVSE_LIMIT,
+    )
+    bus.add(POLLED.charger(config, _smartevse_orders()))
+    return bus
+
+
+def master_bus(url: str, units: Iterable[int], supply: float) -> Bus:
+    """Return a bus with slaves on it that share a supply, A."""
+    bus = MASTER.bus(url, supply=Supply(limit=supply))
+    for unit in units:
+        config = SlaveConfig(
+            key=f"smartevse-{unit}",
+            name=f"SmartEVSE {unit}",
+            address=unit,
+            installation_limit=SMARTEVSE_LIMIT,
+        )
+        bus.add(MASTER.charger(config, _smartevse_orders()))
+    return bus
+
+
+def _smartevse_orders() -> Orders:
+    return Orders(limit=CurrentLimit(current=SMARTEVSE_LIMIT), allowed=True)
 
 
 async def settled(bus: Bus, dead: Iterable[str] = ()) -> None:

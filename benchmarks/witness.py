@@ -7,16 +7,17 @@ one clock for the whole machine, so times of the log can be compared with ours.
 """
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 import json
 import sys
-from typing import Any, Self
+from typing import Any, Final, Self
 
 from tests.virtual import CLIENT, AblBox, Car, EvboxChargePoint, Module, VirtualBus
 from tests.virtual.device import Device
 
 from .machine import ROOT
+from .offers import Offer, offers_of, smartevse_boxes
 
 _READY_WITHIN = 15.0
 _ENDS_WITHIN = 10.0
@@ -32,13 +33,14 @@ class Heard:
     end: float
     from_client: bool
     data: bytes
+    collided: bool = False
 
 
 class Witness:
     """A virtual bus in another process."""
 
     def __init__(self, protocol: str, **options: object) -> None:
-        """Say who is on the bus (see `_abl`, `_evbox`)."""
+        """Say who is on the bus (see `_MAKERS`)."""
         self._spec = json.dumps({"protocol": protocol, **options})
         self._process: asyncio.subprocess.Process | None = None
         self.url = ""
@@ -76,9 +78,14 @@ class Witness:
         """Return what was on the wire from then on, frame by frame."""
         entries: Any = await self._ask({"log": since})
         return [
-            Heard(start, end, from_client, bytes.fromhex(data))
-            for start, end, from_client, data in entries
+            Heard(start, end, from_client, bytes.fromhex(data), collided)
+            for start, end, from_client, data, collided in entries
         ]
+
+    async def offers(self) -> list[Offer]:
+        """Return what SmartEVSEs have offered, change by change."""
+        entries: Any = await self._ask({"offers": True})
+        return [Offer(*entry) for entry in entries]
 
     async def stats(self) -> dict[str, Any]:
         """Return the virtual chargers' own counters."""
@@ -141,6 +148,13 @@ def _evbox(*, serials: Sequence[int], modules: int) -> list[Device]:
     return points
 
 
+_MAKERS: Final[dict[str, Callable[..., list[Device]]]] = {
+    "abl": _abl,
+    "evbox": _evbox,
+    "smartevse": smartevse_boxes,
+}
+
+
 def _do(bus: VirtualBus, command: dict[str, Any]) -> object:
     if "kill" in command:
         for device in bus.devices:
@@ -149,11 +163,20 @@ def _do(bus: VirtualBus, command: dict[str, Any]) -> object:
         return None
     if "stats" in command:
         return bus.stats()
+    if "offers" in command:
+        offers = bus.call(lambda: offers_of(bus.devices))
+        return [(one.at, one.name, one.amps, one.closed) for one in offers]
     since = command["log"]
     heard = [*bus.log.bursts(CLIENT), *(e for e in bus.log if e.source != CLIENT)]
     heard.sort(key=lambda entry: entry.t)
     return [
-        (entry.t, entry.end, entry.source == CLIENT, entry.data.hex())
+        (
+            entry.t,
+            entry.end,
+            entry.source == CLIENT,
+            entry.data.hex(),
+            entry.collided,
+        )
         for entry in heard
         if entry.t >= since
     ]
@@ -162,7 +185,7 @@ def _do(bus: VirtualBus, command: dict[str, Any]) -> object:
 def _main() -> None:
     spec = json.loads(sys.argv[1])
     protocol = spec.pop("protocol")
-    devices = _abl(**spec) if protocol == "abl" else _evbox(**spec)
+    devices = _MAKERS[protocol](**spec)
     with VirtualBus.pty(*devices, ring=None) as bus:
         print(json.dumps(bus.url), flush=True)
         for line in sys.stdin:
