@@ -5,8 +5,8 @@ from typing import Final
 from .abl import PROTOCOL as ABL
 from .evbox import PROTOCOL as EVBOX
 from .protocol import Protocol
-from .smartevse import POLLED as SMARTEVSE
+from .smartevse import MASTER as SMARTEVSE_MASTER, POLLED as SMARTEVSE
 
 PROTOCOLS: Final[dict[str, Protocol]] = {
-    protocol.key: protocol for protocol in (EVBOX, ABL, SMARTEVSE)
+    protocol.key: protocol for protocol in (EVBOX, ABL, SMARTEVSE, SMARTEVSE_MASTER)
 }
