@@ -2,8 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 import pytest
 
 from custom_components.evse_bus.evse.smartevse.sharing import (
@@ -196,7 +195,7 @@ class World:
             if draw.may_draw or unit == asking:
                 wish = min(wish, LOWEST) if fixed else wish
                 active.append(Claim(unit=unit, wish=wish, came=unit, fixed=fixed))
-        return {u: 0 for u in self.draws} | split(self.limit, self.minimum, active)
+        return dict.fromkeys(self.draws, 0) | split(self.limit, self.minimum, active)
 
     def broadcast(self, hearing: set[int], asking: int | None = None) -> None:
         values = next_values(self.limit, self.shares(asking), self.draws, self.now)
