@@ -97,7 +97,7 @@ async def test_slaves_are_found_and_added(hass: HomeAssistant) -> None:
         assert flow.step == "confirm_smartevse_master"
         table = flow.result["description_placeholders"]["chargers"]
         assert table == "| Left | 2 | 16 A | 6 A |\n| Right | 4 | 13 A | 6 A |"
-        assert flow.tells("at most 25 A per phase", "at least 7 A", "for 10 s")
+        assert flow.tells("25 A per phase", "less than 7 A", "for 10 s")
         await flow.submit()
 
     entry = flow.result["result"]
@@ -148,6 +148,7 @@ async def test_another_master_is_noticed_and_nothing_is_said(
 
         # The other one is set to Slave, as the text says.
         bus.remove(other)
+        monkeypatch.setattr(master, "LISTENING", 0.3)
         await flow.choose("scan")
         await flow.wait()
         assert flow.step == "select"
