@@ -33,6 +33,10 @@ class Field[V](ABC):
     def encode(self, value: object) -> bytes:
         """Return the bytes of a value; raises RefusedOrderError."""
 
+    def rewrite(self, data: bytes, value: object) -> bytes:  # noqa: ARG002
+        """Return the bytes of a value in the place of these; as `encode`."""
+        return self.encode(value)
+
     def impossible(self, what: object) -> ImplausibleReplyError:
         """Return the error for a reply that says what cannot be."""
         message = f"{self.name} cannot be {what}"
@@ -108,6 +112,12 @@ class Bits(Field[IntFlag]):
         if not isinstance(value, self.kind) or value not in _BYTE:
             raise self.refused(f"is a {self.kind.__name__}")
         return bytes((value,))
+
+    @override
+    def rewrite(self, data: bytes, value: object) -> bytes:
+        # `flags & ~bit` drops what is no member, so those bits come from the box.
+        known = sum(self.kind)
+        return bytes((data[0] & ~known | self.encode(value)[0] & known,))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -61,10 +61,11 @@ class Struct[T]:
             raise RefusedOrderError(message)
         parts, at = [], 0
         for field in self.fields:
+            old = data[at : at + field.width]
             if field.name in changes:
-                parts.append(field.encode(changes[field.name]))
+                parts.append(field.rewrite(old, changes[field.name]))
             else:
-                parts.append(data[at : at + field.width])
+                parts.append(old)
             at += field.width
         return b"".join(parts)
 
