@@ -1,0 +1,249 @@
+"""What slaves ask for, and what they are answered: in time, or not at all."""
+
+import asyncio
+
+import pytest
+
+from custom_components.evse_bus.evse.model import OrderChange
+from custom_components.evse_bus.evse.smartevse.master import PERIOD
+from tests.evse.simulated import now, simulate
+from tests.evse.smartevse.ether import MasterScene, Sent
+
+
+def crc(head: str) -> bytes:
+    value = 0xFFFF
+    for byte in bytes.fromhex(head):
+        value ^= byte
+        for _ in range(8):
+            value = value >> 1 ^ 0xA001 if value & 1 else value >> 1
+    return value.to_bytes(2, "little")
+
+
+def frame(head: str) -> bytes:
+    return bytes.fromhex(head) + crc(head)
+
+
+PLUGGED = bytes.fromhex("020600020082a858")
+ASKS = bytes.fromhex("020600030082f998")
+LEFT = frame("020600010000")
+ENDED = frame("020600040000")
+NOT_ASKED = "02060084"
+
+
+def answers(scene: MasterScene, since: float = 0.0) -> list[Sent]:
+    """Acknowledgements to anybody."""
+    return [
+        sent
+        for sent in scene.line.sent
+        if sent.data[1] == 6 and sent.data[2:3] == b"\x00" and sent.when >= since
+    ]
+
+
+@pytest.mark.parametrize("before", [1.0, 0.3, 0.1, 0.05, 0.03, 0.015])
+def test_answered_in_time_also_right_before_a_broadcast(before: float) -> None:
+    async def scene() -> None:
+        async with MasterScene(units=(2,)) as scene:
+            await asyncio.sleep(6)
+            await asyncio.sleep(scene.master.slot.ready + PERIOD - before - now())
+            asked = now()
+            scene.line.say(LEFT)
+            await asyncio.sleep(0.5)
+            (answer,) = answers(scene, asked)
+            assert answer.data == frame("020600810000")
+            assert answer.when - asked < 0.2
+            assert max(scene.gaps()) <= PERIOD + 0.02
+
+    simulate(scene())
+
+
+def test_answered_in_time_in_the_midst_of_a_time_out() -> None:
+    async def scene() -> None:
+        async with MasterScene(units=(2, 3)) as scene:
+            await asyncio.sleep(6)
+            scene.box(3).deaf = True
+            start = len(scene.line.sent)
+            await scene.until(
+                lambda: any(s.data[0] == 3 for s in scene.line.sent[start:])
+            )
+            asked = now()
+            scene.line.say(LEFT)
+            await asyncio.sleep(0.9)
+            (answer,) = answers(scene, asked)
+            # The time-out is 0.25 s, and counted from the end of the request.
+            assert answer.when - asked < 0.45
+
+    simulate(scene())
+
+
+def test_a_repeated_request_has_one_answer_each() -> None:
+    async def scene() -> None:
+        async with MasterScene(units=(2,)) as scene:
+            await asyncio.sleep(6)
+            asked = now()
+            scene.line.say(LEFT)
+            await asyncio.sleep(0.3)
+            scene.line.say(LEFT)
+            await asyncio.sleep(0.3)
+            assert len(answers(scene, asked)) == 2
+
+    simulate(scene())
+
+
+def test_state_b_is_acknowledged_only_when_asked_for() -> None:
+    async def scene() -> None:
+        async with MasterScene(units=(2,)) as scene:
+            await asyncio.sleep(5)
+            await scene.charge(2)
+            await asyncio.sleep(5)
+            assert scene.frames(NOT_ASKED) == []
+            ended = now()
+            scene.box(2).car.finish()
+            await asyncio.sleep(3)
+            assert scene.frames(NOT_ASKED, ended) == [frame("020600840000").hex()]
+            assert scene.box(2).state == "B"
+
+    simulate(scene())
+
+
+@pytest.mark.parametrize(
+    "stops",
+    [OrderChange(allowed=False), OrderChange(current=0.0)],
+    ids=["off", "0 A"],
+)
+def test_nothing_is_granted_to_a_box_that_may_not_charge(stops: OrderChange) -> None:
+    """Somebody has opened its access at the box: it asks, and gets nothing."""
+
+    async def scene() -> None:
+        async with MasterScene(units=(2,)) as scene:
+            await asyncio.sleep(5)
+            await scene.slave(2).change_orders(stops)
+            asked = now()
+            scene.box(2).controller.outlet.set_access(True)
+            scene.box(2).car.plug_in()
+            scene.line.say(ASKS)
+            await asyncio.sleep(20)
+            assert answers(scene, asked)
+            for answer in answers(scene, asked):
+                assert answer.data[4:6] == b"\x00\x00", answer
+            assert scene.most == 0
+            assert not scene.box(2).controller.outlet.access
+
+    simulate(scene())
+
+
+def test_nothing_is_granted_where_the_supply_is_used_up() -> None:
+    async def scene() -> None:
+        async with MasterScene(limit=10.0) as scene:
+            await asyncio.sleep(5)
+            await scene.charge(2)
+            asked = now()
+            scene.box(3).car.plug_in()
+            await asyncio.sleep(3)
+            (answer,) = answers(scene, asked)
+            assert answer.data == frame("030600820000")
+            assert scene.box(3).controller.outlet.error & 1
+            assert scene.box(2).offers == 10
+
+    simulate(scene())
+
+
+def test_room_is_made_first_and_well_within_the_second() -> None:
+    async def scene() -> None:
+        async with MasterScene() as scene:
+            await asyncio.sleep(5)
+            await scene.charge(2)
+            await asyncio.sleep(13)
+            assert scene.box(2).offers == 16
+            scene.box(3).car.plug_in(request=False)
+            await scene.until(lambda: scene.box(3).state == "B")
+            # What was promised to it has been given back meanwhile.
+            await scene.until(lambda: scene.box(2).offers == 16)
+            asked = now()
+            scene.box(3).car.request()
+            await scene.until(lambda: scene.box(3).state == "G")
+            took = await scene.until(lambda: scene.box(3).state == "C")
+            assert took < 0.6
+            sent = [s for s in scene.line.sent if s.when >= asked]
+            order = [s.data.hex()[:8] for s in sent]
+            lowered = next(
+                i for i, s in enumerate(sent) if s.is_broadcast and s.words[1] == 80
+            )
+            assert order[lowered : lowered + 3] == [
+                "00100001",
+                "020400a0",
+                "03060083",
+            ]
+            assert sent[lowered + 2].data[4:6] == (80).to_bytes(2, "big")
+
+    simulate(scene())
+
+
+def test_room_that_is_not_confirmed_is_not_granted() -> None:
+    """The other misses each broadcast from now on: it goes on with what it has."""
+
+    async def scene() -> None:
+        async with MasterScene() as scene:
+            await asyncio.sleep(5)
+            await scene.charge(2)
+            await asyncio.sleep(13)
+            scene.box(2).misses = lambda data: data.startswith(b"\x00\x10")
+            asked = now()
+            scene.box(3).car.plug_in()
+            await asyncio.sleep(5)
+            assert {a.data[4:6] for a in answers(scene, asked)} == {b"\x00\x00"}
+            assert scene.box(3).offers == 0
+
+    simulate(scene())
+
+
+def test_a_maximum_told_with_a_request_limits_it() -> None:
+    async def scene() -> None:
+        async with MasterScene(units=(2,), maximum=13) as scene:
+            await asyncio.sleep(5)
+            await scene.charge(2)
+            await asyncio.sleep(3)
+            assert scene.slave(2).limits.reported == 13
+            assert scene.offers == 13
+            # A cable that carries less, with a car that comes with it.
+            scene.line.say(frame("02060003005a"))
+            await asyncio.sleep(3)
+            assert scene.broadcasts()[-1].words == (0, 90, 0, 0)
+
+    simulate(scene())
+
+
+def test_a_box_that_was_not_read_is_not_answered() -> None:
+    async def scene() -> None:
+        async with MasterScene(units=(2,)) as scene:
+            scene.box(2).deaf = True
+            await asyncio.sleep(6)
+            scene.line.say(ASKS)
+            await asyncio.sleep(2)
+            assert answers(scene) == []
+            # Nor is one that is not set up.
+            scene.line.say(frame("040600030082"))
+            await asyncio.sleep(2)
+            assert answers(scene) == []
+
+    simulate(scene())
+
+
+def test_a_late_answer_is_none() -> None:
+    """Others keep talking: after 1 s the box asks again, and a late word would count."""
+
+    async def scene() -> None:
+        async with MasterScene(units=(2,)) as scene:
+            await asyncio.sleep(6)
+            asked = now()
+            scene.line.say(LEFT)
+            await asyncio.sleep(0.012)
+            while now() < asked + 1.2:
+                scene.line.noise(b"\x55")
+                await asyncio.sleep(0.004)
+            await asyncio.sleep(0.5)
+            assert answers(scene, asked) == []
+            scene.line.say(LEFT)
+            await asyncio.sleep(0.3)
+            assert len(answers(scene, asked)) == 1
+
+    simulate(scene())
