@@ -1,0 +1,1 @@
+"""SmartEVSE: the library against what is known of the boxes."""

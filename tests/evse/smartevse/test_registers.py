@@ -1,0 +1,371 @@
+"""Registers of a SmartEVSE: bytes of the recorded firmware, and anything at all."""
+
+from dataclasses import replace
+
+from hypothesis import given, strategies as st
+import pytest
+
+from custom_components.evse_bus.evse.errors import (
+    ExchangeRefusedError,
+    ImplausibleReplyError,
+    RefusedOrderError,
+)
+from custom_components.evse_bus.evse.modbus import ModbusFrame, RtuFramer, rtu_frame
+from custom_components.evse_bus.evse.model import (
+    CurrentLimit,
+    Fault,
+    Limits,
+    Mode,
+    Orders,
+    Setting,
+    Status as Word,
+)
+from custom_components.evse_bus.evse.safety import clamp
+from custom_components.evse_bus.evse.smartevse.dialects import (
+    MAPS,
+    PROBE_A0,
+    PROBE_A9,
+    Block,
+    Dialect,
+)
+from custom_components.evse_bus.evse.smartevse.probing import Probe
+from custom_components.evse_bus.evse.smartevse.registers import (
+    Status,
+    decode_configuration,
+    decode_status,
+    read_answer,
+    read_request,
+    write_access,
+    write_answer,
+    write_current,
+    write_mode,
+    write_setting,
+)
+from custom_components.evse_bus.evse.smartevse.states import (
+    is_stopped,
+    offered,
+    state_of,
+    tells_plug,
+    word_of,
+)
+
+from .polled import ALL, LATER, V2_17, V2_20
+
+each = pytest.mark.parametrize("dialect", ALL)
+LIMITS = Limits(installation=80.0)
+
+
+def setpoint(current: float):  # type: ignore[no-untyped-def] # noqa: ANN201
+    return clamp(Orders(limit=CurrentLimit(current=current)), LIMITS)
+
+
+def frame(text: str) -> ModbusFrame:
+    (found,) = RtuFramer().feed(bytes.fromhex(text))
+    return found
+
+
+def words(*values: int) -> bytes:
+    return b"".join(value.to_bytes(2, "big") for value in values)
+
+
+def later(state: int = 2, *, serial: int = 4711, kelvin: int = 293) -> bytes:
+    return words(state, 0, 100, 1, 0, 1, 0, 16, 0, 0, kelvin, serial)
+
+
+def test_requests_as_recorded() -> None:
+    assert read_request(0, PROBE_A0).hex() == "000400a0000931ff"
+    assert read_request(1, PROBE_A0).hex() == "010400a00009302e"
+    assert read_request(0, Block(0xC0, 9)).hex() == "000400c0000931e1"
+    written = write_current(0, V2_17, setpoint(14.0))
+    assert written.hex() == "001000a6000102008cb2a3"
+    assert write_access(0, V2_17, allowed=False).hex() == "001000a70001020000b2d7"
+    assert write_access(0, V2_17, allowed=True).hex() == "001000a700010200017317"
+    assert write_access(2, V2_17, allowed=False).hex() == "021000a70001020000abb7"
+
+
+def test_status_as_recorded() -> None:
+    data = read_answer(0, PROBE_A0)(
+        frame("0004120043000000100006000000000082000100009f06")
+    )
+    assert data is not None
+    assert decode_status(V2_17, data) == Status(
+        raw_state="C",
+        error=0,
+        current=13.0,
+        access=True,
+        mode=Mode.NORMAL,
+        maximum=16,
+        minimum=6,
+    )
+
+
+def test_no_communication_as_recorded() -> None:
+    data = read_answer(2, PROBE_A0)(
+        frame("0204120041000200100006000000000050000100002797")
+    )
+    assert data is not None
+    status = decode_status(V2_17, data)
+    assert status.faults == {Fault.NO_COMM}
+    assert word_of(V2_17, status) is Word.FAULTED
+    assert not tells_plug(V2_17, status)
+
+
+def test_configuration_as_recorded() -> None:
+    """The defaults: minimum 6 A, circuit 16 A, maximum 13 A, mains 25 A."""
+    blocks = MAPS[V2_17].configuration
+    first = bytes.fromhex("000000000006001000000004000000000000")
+    second = bytes.fromhex("000d00000019")
+    told = decode_configuration(V2_17, dict(zip(blocks, (first, second), strict=True)))
+    assert told.settings == {
+        Setting.MINIMUM_CURRENT: 6,
+        Setting.MAXIMUM_CURRENT: 13,
+        Setting.MAINS_CURRENT: 25,
+    }
+    assert told.load_balancing == 0
+
+
+def test_the_malformed_exceptions() -> None:
+    with pytest.raises(ExchangeRefusedError) as refused:
+        read_answer(0, Block(0xB0, 1))(frame("000402f2c1"))
+    assert refused.value.code == 2
+    accept = write_answer(0, 0xA6)
+    # "No", and it is obeyed all the same: perhaps.
+    assert accept(frame("0010033c01")) is False
+    assert accept(frame("001000a70001b1fb")) is None
+    assert write_answer(0, 0xA7)(frame("001000a70001b1fb")) is True
+    assert write_answer(0, 0xA7)(frame("021000a70001b019")) is None
+    with pytest.raises(ExchangeRefusedError):
+        accept(frame(rtu_frame(0, b"\x10\x02").hex()))
+    with pytest.raises(ExchangeRefusedError):
+        read_answer(1, PROBE_A9)(frame(rtu_frame(1, b"\x83\x02").hex()))
+
+
+def test_0_a_is_never_written() -> None:
+    paused = clamp(Orders(limit=CurrentLimit(current=0)), LIMITS)
+    for dialect in ALL:
+        with pytest.raises(RefusedOrderError):
+            write_current(0, dialect, paused)
+
+
+def test_a_box_has_an_address() -> None:
+    for unit in (-1, 9, 255):
+        with pytest.raises(RefusedOrderError):
+            write_access(unit, V2_17, allowed=True)
+
+
+def test_mode_and_settings() -> None:
+    assert write_mode(1, LATER, Mode.SOLAR)[2:9] == bytes.fromhex("00030001020002")
+    written = write_setting(1, LATER, Setting.SOLAR_START_CURRENT, 4)
+    assert written[2:9] == bytes.fromhex("0205000102000c")
+    for value in (-17, 17):
+        with pytest.raises(RefusedOrderError):
+            write_setting(1, LATER, Setting.SOLAR_START_CURRENT, value)
+
+
+# -- Anything at all -----------------------------------------------------------------
+
+
+@each
+@given(data=st.binary(max_size=40))
+def test_any_bytes_are_a_status_or_held_back(dialect: Dialect, data: bytes) -> None:
+    try:
+        status = decode_status(dialect, data)
+    except ImplausibleReplyError:
+        return
+    state_of(dialect, status.raw_state)
+    word_of(dialect, status)
+    current = offered(dialect, status)
+    assert current is None or current == 0 or 6 <= current <= 80
+    if is_stopped(dialect, status):
+        assert not status.access
+        assert status.raw_state not in {"C", "D"}
+
+
+_word = st.one_of(st.integers(0, 12), st.integers(0x41, 0x54), st.integers(0, 0xFFFF))
+
+
+@each
+@given(values=st.lists(_word, min_size=9, max_size=9), more=st.lists(_word, max_size=3))
+def test_nearly_a_status(dialect: Dialect, values: list[int], more: list[int]) -> None:
+    layout = MAPS[dialect]
+    count = layout.status.count
+    told = (values + more + [0] * 3)[:count]
+    try:
+        status = decode_status(dialect, words(*told))
+    except ImplausibleReplyError:
+        return
+    assert told[0] in layout.states
+    assert status.current == told[layout.current] / 10
+    assert status.access is (told[layout.access] == 1)
+
+
+@each
+@given(data=st.data())
+def test_any_settings_are_in_their_range_or_held_back(
+    dialect: Dialect, data: st.DataObject
+) -> None:
+    layout = MAPS[dialect]
+    told = {
+        block: words(
+            *data.draw(
+                st.lists(
+                    st.integers(0, 40) | st.integers(0, 0xFFFF),
+                    min_size=block.count,
+                    max_size=block.count,
+                )
+            )
+        )
+        for block in layout.configuration
+    }
+    try:
+        configuration = decode_configuration(dialect, told)
+    except ImplausibleReplyError:
+        return
+    for setting, value in configuration.settings.items():
+        span = layout.settings[setting].range
+        assert span.minimum <= value <= span.maximum
+        # And it is written as it was read.
+        kept = layout.settings[setting]
+        assert kept.value(kept.word(value)) == value
+
+
+def test_settings_that_are_not_all_told() -> None:
+    with pytest.raises(ImplausibleReplyError):
+        decode_configuration(V2_17, {})
+
+
+@each
+@given(current=st.floats(6, 80), unit=st.integers(0, 8), allowed=st.booleans())
+def test_what_is_written_is_what_was_clamped(
+    dialect: Dialect, current: float, unit: int, *, allowed: bool
+) -> None:
+    request = write_current(unit, dialect, setpoint(current))
+    found = frame(request.hex())
+    tenths = int.from_bytes(found.data[-2:], "big")
+    assert 60 <= tenths <= 800
+    assert tenths / 10 <= current < tenths / 10 + 0.1 + 1e-9
+    assert found.unit == unit
+    access = frame(write_access(unit, dialect, allowed=allowed).hex())
+    assert access.data[-1] == allowed
+
+
+# -- The dialect ---------------------------------------------------------------------
+
+A0_17 = words(0x41, 0, 0, 6, 0, 0, 0, 1, 0)
+A0_20 = words(0, 0, 0, 6, 0, 0, 0, 1, 0)
+
+
+def test_a_letter_is_2_17() -> None:
+    probe = Probe()
+    probe.told(A0_17)
+    assert probe.found is V2_17
+
+
+def test_a_number_alone_is_not_2_20() -> None:
+    probe = Probe()
+    probe.told(A0_20)
+    assert probe.found is None
+    assert probe.ask == PROBE_A9
+    probe.told(words(0, 0, 0))
+    assert probe.found is V2_20
+
+
+def test_without_a0_it_may_be_a_later_one() -> None:
+    probe = Probe()
+    probe.refused(2)
+    assert probe.found is None
+    assert probe.ask == MAPS[LATER].status
+    probe.told(later())
+    assert probe.found is LATER
+
+
+@pytest.mark.parametrize("code", [1, 3, 4, None])
+def test_another_refusal_is_no_smartevse(code: int | None) -> None:
+    with pytest.raises(ImplausibleReplyError):
+        Probe().refused(code)
+
+
+def test_a_number_without_a9_is_no_known_dialect() -> None:
+    probe = Probe()
+    probe.told(A0_20)
+    with pytest.raises(ImplausibleReplyError):
+        probe.refused(2)
+    assert probe.found is None
+
+
+def test_a_meter_is_no_smartevse() -> None:
+    """Twelve words of floating point numbers at unit 1."""
+    probe = Probe()
+    probe.refused(2)
+    with pytest.raises(ImplausibleReplyError):
+        probe.told(words(0x4366, 0x1999, 0x4365, 0x8000, *([0x4100] * 8)))
+    assert probe.found is None
+
+
+@given(
+    st.lists(
+        st.one_of(
+            st.none(),
+            st.integers(0, 255),
+            st.binary(max_size=30),
+            st.sampled_from((A0_17, A0_20, words(0, 0, 0), later())),
+        ),
+        max_size=6,
+    )
+)
+def test_a_dialect_is_found_only_by_its_own_words(
+    answers: list[int | bytes | None],
+) -> None:
+    probe = Probe()
+    asked = [probe.ask]
+    for answer in answers:
+        if probe.found is not None:
+            break
+        try:
+            if isinstance(answer, bytes):
+                probe.told(answer)
+            else:
+                probe.refused(answer)
+        except ImplausibleReplyError:
+            assert probe.found is None
+            break
+        asked.append(probe.ask)
+    if probe.found is V2_20:
+        assert PROBE_A9 in asked
+    if probe.found is LATER:
+        assert MAPS[LATER].status in asked
+
+
+# -- States --------------------------------------------------------------------------
+
+
+def test_a_without_access_is_not_unplugged() -> None:
+    status = decode_status(V2_17, words(0x41, 0, 16, 6, 0, 0, 130, 0, 0))
+    assert not tells_plug(V2_17, status)
+    assert word_of(V2_17, status) is Word.UNAVAILABLE
+    assert is_stopped(V2_17, status)
+    assert offered(V2_17, status) == 0
+    assert tells_plug(V2_17, replace(status, access=True))
+
+
+def test_later_states() -> None:
+    stopping = decode_status(LATER, later(10))
+    assert stopping.raw_state == "C1"
+    assert state_of(LATER, "C1").charging is None
+    waiting = replace(stopping, raw_state="B1", access=False)
+    assert is_stopped(LATER, waiting)
+    assert word_of(LATER, waiting) is Word.SUSPENDED_EVSE
+    assert tells_plug(LATER, waiting)
+    assert stopping.serial == "4711"
+    assert stopping.temperature == 20
+
+
+def test_a_temperature_that_cannot_be_is_none() -> None:
+    assert decode_status(LATER, later(kelvin=0)).temperature is None
+    assert decode_status(LATER, later(serial=0)).serial is None
+
+
+def test_nothing_to_say_is_6_a() -> None:
+    """A broadcast of 0 to a charging slave: the contactor stays closed."""
+    status = decode_status(V2_17, words(0x43, 0, 16, 6, 0, 0, 0, 1, 0))
+    assert offered(V2_17, status) == 6
