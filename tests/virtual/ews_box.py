@@ -165,7 +165,7 @@ class EwsBox(EwsHands):
         """Tell whether it counts as connected: by TCP, or by commands."""
         if self.network:
             return self.link_up
-        return bool(self.commands) and self.silent_for < COMMAND_TIMEOUT
+        return self.requests > 0 and self.silent_for < COMMAND_TIMEOUT
 
     @property
     def silent_for(self) -> float:
@@ -302,6 +302,7 @@ class EwsBox(EwsHands):
         if self._false_lengths:
             difference = self._false_lengths.pop(0)
             data = with_false_length(parameters, difference, self.bcc)
+        self._send_rest()
         wait = self.turn_round + self.bus.rng.random() * self.jitter
         mix = self._mixes.pop(0) if self._mixes else None
         if mix is None:
@@ -310,11 +311,7 @@ class EwsBox(EwsHands):
         record = b"" if mix.where == "none" else self._record(mix.bits, {})
         first, rest = mixed(data, record, mix)
         self.replies += 1
-        start = self.bus.time() + wait
-        self.bus.send_at(self, first, start)
-        if rest:
-            later = start + len(first) * self.bus.byte_time + mix.pause
-            self.bus.send_at(self, rest, later)
+        self.bus.loop.call_later(wait, self._send_cut, first, rest, mix.pause)
 
     def _record(self, bits: int, keys: dict[int, int]) -> bytes:
         key_bytes = bytes(keys.get(index, 0) for index in range(8))
@@ -372,6 +369,7 @@ class EwsBox(EwsHands):
             port.step(now)
             port.power_off(now, restart=restart, mains=mains)
         self.powered = False
+        self._rest = None
         self._bits, self._keys = 0, {}
         self.frames.reset()
 

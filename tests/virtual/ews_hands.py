@@ -9,6 +9,7 @@ from .ews_frames import DEBUG, Bcc, frame
 from .ews_rfid import Card
 
 if TYPE_CHECKING:
+    import asyncio
     from collections.abc import Callable
 
     from .ews_io import UserInterface
@@ -60,6 +61,7 @@ class EwsHands(Device):
         self._mixes: list[InfoMix] = []
         self._false_lengths: list[int] = []
         self._power_on_at: float | None = None
+        self._rest: tuple[asyncio.TimerHandle, bytes] | None = None
 
     def _lose_power(self, *, mains: bool) -> None:
         raise NotImplementedError
@@ -139,7 +141,26 @@ class EwsHands(Device):
     def send_raw(self, data: bytes) -> None:
         """Send bytes as they are."""
         if self.bus is not None and self.powered and not self.faults.dead:
+            self._send_rest()
             self.bus.send_at(self, data, self.bus.time())
+
+    def _send_cut(self, first: bytes, rest: bytes, pause: float) -> None:
+        """Send the first lump, and the second one after a pause."""
+        if self.bus is None or not self.powered or self.faults.dead:
+            return
+        self._send_rest()
+        self.bus.send_at(self, first, self.bus.time())
+        if rest:
+            wait = len(first) * self.bus.byte_time + pause
+            timer = self.bus.loop.call_later(wait, self._send_rest)
+            self._rest = (timer, rest)
+
+    def _send_rest(self) -> None:
+        """Send what was cut off; at once if something else is to be sent."""
+        rest, self._rest = self._rest, None
+        if rest is not None and self.bus is not None:
+            rest[0].cancel()
+            self.bus.send_at(self, rest[1], self.bus.time())
 
     def send_debug(self, text: bytes = b"debug") -> None:
         """Send a 'D' message: for nobody."""
