@@ -185,6 +185,25 @@ async def test_no_second_box_on_a_bus_that_polls(hass: HomeAssistant) -> None:
     assert get(entry, "Other").data["stop_on_shutdown"] is True
 
 
+async def test_box_is_searched_on_a_bus_that_has_lost_its_own(
+    hass: HomeAssistant,
+) -> None:
+    with VirtualBus.pty(SmartEvse()) as bus:
+        entry = await setup_bus(hass, "smartevse", bus.url)
+        flow = await Flow.add_charger(hass, entry)
+        await flow.choose("scan")
+        await flow.wait()
+        assert flow.step == "select"
+        await flow.submit({"chargers": "0", "installation_limit": 16})
+        await flow.submit(charger("New") | {"stop_on_shutdown": False})
+        await flow.submit()
+        await hass.async_block_till_done()
+        assert get(entry, "New").unique_id == "smartevse_address_0"
+        [running] = entry.runtime_data.bus.chargers.values()
+        await bus.wait_for_async(lambda: running.available)
+        await take_down(hass, entry)
+
+
 # -- Changing ----------------------------------------------------------------------
 
 
