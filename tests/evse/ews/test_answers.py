@@ -84,18 +84,18 @@ SAID = {
 }
 
 
-@pytest.mark.parametrize("code", range(1, 256))
-def test_every_code_of_sl(code: int) -> None:
-    with pytest.raises(EwsRefusedError) as caught:
-        confirmed(CommandId.START_STOP)(bytes((code,)))
-    error = caught.value
-    assert isinstance(error, ExchangeRefusedError)
-    assert (error.code, error.command) == (code, CommandId.START_STOP)
-    assert SAID.get(code, SAID[255]) in str(error)
-    assert str(error).endswith(f"(sl: {code})")
-    unknown = code not in START_STOP_CODES
-    assert (error.reason is Refusal.UNKNOWN) == unknown
-    assert unknown == (code == 8 or code > 12)
+def test_every_code_of_sl() -> None:
+    for code in range(1, 256):
+        with pytest.raises(EwsRefusedError) as caught:
+            confirmed(CommandId.START_STOP)(bytes((code,)))
+        error = caught.value
+        assert isinstance(error, ExchangeRefusedError)
+        assert (error.code, error.command) == (code, CommandId.START_STOP)
+        assert SAID.get(code, SAID[255]) in str(error)
+        assert str(error).endswith(f"(sl: {code})")
+        unknown = code not in START_STOP_CODES
+        assert (error.reason is Refusal.UNKNOWN) == unknown
+        assert unknown == (code == 8 or code > 12)
 
 
 def test_the_codes_of_sl_have_words_of_their_own() -> None:

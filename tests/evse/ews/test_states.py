@@ -66,16 +66,16 @@ def test_no_state_is_left_out() -> None:
     assert STATES.keys() == MANUAL.keys()
 
 
-@pytest.mark.parametrize("code", sorted(set(range(256)) - MANUAL.keys()))
-def test_a_state_that_the_manual_does_not_know_stays_raw(code: int) -> None:
-    state = state_of(code)
-    assert state.name == f"0x{code:02X}"
-    assert (state.plugged, state.charging) == (None, None)
-    if 0xA0 <= code <= 0xAF:
-        # 3.1.2: "0xAx: error".
-        assert (state.status, state.fault) == (Status.FAULTED, Fault.UNKNOWN)
-    else:
-        assert (state.status, state.fault) == (None, None)
+def test_a_state_that_the_manual_does_not_know_stays_raw() -> None:
+    for code in set(range(256)) - MANUAL.keys():
+        state = state_of(code)
+        assert state.name == f"0x{code:02X}"
+        assert (state.plugged, state.charging) == (None, None)
+        if 0xA0 <= code <= 0xAF:
+            # 3.1.2: "0xAx: error".
+            assert (state.status, state.fault) == (Status.FAULTED, Fault.UNKNOWN)
+        else:
+            assert (state.status, state.fault) == (None, None)
 
 
 def test_a_fixed_cable_is_no_car() -> None:
@@ -176,10 +176,10 @@ def test_what_may_be_ordered_in_which_state(
             check_order(order, code, paused=paused)
 
 
-@pytest.mark.parametrize("code", sorted(set(range(256)) - {0x40, 0x41, 0x42, 0x43}))
-def test_a_pause_never_unlocks(code: int) -> None:
-    for paused in (True, False):
-        assert not is_allowed(StartStop.PAUSE, code, paused=paused)
+def test_a_pause_never_unlocks() -> None:
+    for code in set(range(256)) - {0x40, 0x41, 0x42, 0x43}:
+        for paused in (True, False):
+            assert not is_allowed(StartStop.PAUSE, code, paused=paused)
 
 
 @pytest.mark.parametrize("code", [0x00, 0x10])

@@ -86,13 +86,13 @@ def test_rc_of_another_length(length: int) -> None:
         decode_ports((2 * PORTS)[:length])
 
 
-@pytest.mark.parametrize("code", range(256))
-def test_codes_that_the_manual_does_not_know_stay_raw(code: int) -> None:
-    data = changed(changed(changed(PORTS, 0, code), 4, code), 6, code)
-    port = decode_ports(data)[0]
-    assert (port.status, port.start_code, port.result_code) == (code, code, code)
-    assert (port.start is None) == (code > 2)
-    assert (port.result is None) == (code not in {1, 3, 4, 5, 6, 7, 8, 9})
+def test_codes_that_the_manual_does_not_know_stay_raw() -> None:
+    for code in range(256):
+        data = changed(changed(changed(PORTS, 0, code), 4, code), 6, code)
+        port = decode_ports(data)[0]
+        assert (port.status, port.start_code, port.result_code) == (code, code, code)
+        assert (port.start is None) == (code > 2)
+        assert (port.result is None) == (code not in {1, 3, 4, 5, 6, 7, 8, 9})
 
 
 @pytest.mark.parametrize(
