@@ -1,7 +1,6 @@
 """A polled SmartEVSE in Home Assistant: limits, access, mode, what it keeps."""
 
 from dataclasses import replace
-import sys
 
 from homeassistant.core import HomeAssistant
 from homeassistant.exceptions import HomeAssistantError, ServiceValidationError
@@ -19,22 +18,9 @@ from tests.common import (
     wait_for_state,
     wait_until,
 )
+from tests.smartevse import car, shorten_quiet
 from tests.test_coordinator import issue
-from tests.virtual import Car, SmartEvse
-
-DIALECTS = ("2.17", "2.20", "later")
-
-
-@pytest.fixture
-def short_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave a later box alone for less than 6.5 s; its time must run faster, too."""
-    charger = "custom_components.evse_bus.evse.smartevse.charger"
-    monkeypatch.setattr(sys.modules[charger], "QUIET", 0.65)
-
-
-def car() -> Car:
-    """Return a car that does at once what it is told."""
-    return Car(reaction=0.0, ramp=0.1)
+from tests.virtual import SmartEvse
 
 
 @pytest.mark.parametrize(
@@ -150,11 +136,10 @@ async def test_to_wait_for_current_is_no_problem(hass: HomeAssistant) -> None:
 # -- Mode ------------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("short_quiet")
-@pytest.mark.parametrize("dialect", DIALECTS)
+@pytest.mark.parametrize("dialect", ["2.17", "2.20"])
 async def test_the_mode_until_a_restart(hass: HomeAssistant, dialect: str) -> None:
     box = SmartEvse(dialect, load_balance=1, mode=1)
-    async with running(hass, box, time_scale=10) as (entry, _):
+    async with running(hass, box) as (entry, _):
         mode = await get_entity(hass, "select", entry, "mode")
         await wait_for_state(hass, mode, "smart")
         await call(hass, "select.select_option", mode, option="solar")
@@ -220,8 +205,11 @@ async def test_a_setting_is_written_once(hass: HomeAssistant) -> None:
         assert sum(box.eeprom_writes.values()) == 1
 
 
-@pytest.mark.usefixtures("all_entities_enabled", "short_quiet")
-async def test_signed_settings(hass: HomeAssistant) -> None:
+@pytest.mark.usefixtures("all_entities_enabled")
+async def test_signed_settings(
+    hass: HomeAssistant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shorten_quiet(monkeypatch)
     box = SmartEvse("later")
     async with running(hass, box, time_scale=10) as (entry, _):
         start = await get_entity(hass, "number", entry, "setting_solar_start_current")
