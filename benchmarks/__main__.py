@@ -71,7 +71,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("names", nargs="*", choices=BENCHMARKS, metavar="NAME")
     parser.add_argument(
-        "--quick", action="store_true", help="a short run: rough figures in 5 minutes"
+        "--quick", action="store_true", help="a short run: rough figures in 8 minutes"
     )
     return parser
 

@@ -146,7 +146,7 @@ async def _start_bus(settings: Settings, bus: DemoBus) -> Program:
 async def _bus_ready(program: Program, bus: DemoBus) -> None:
     try:
         async with asyncio.timeout(BUS_PATIENCE):
-            while not program.printed(f"ready {bus.protocol}"):
+            while not program.printed(bus.ready):
                 if not program.running:
                     break
                 await asyncio.sleep(GLANCE / 4)

@@ -1,4 +1,4 @@
-"""The two buses of the demo: what is on them, and how a person would add them."""
+"""The buses of the demo: what is on them, and how a person would add them."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -13,6 +13,7 @@ class DemoBus:
     """One virtual bus and its chargers."""
 
     protocol: str
+    """Key of the integration's; names the port and the log as well."""
     title: str
     virtual: tuple[str, ...]
     """Arguments of scripts/virtual-chargers."""
@@ -21,13 +22,20 @@ class DemoBus:
     currents: Mapping[str, float]
     """Charging current to begin with by name, A."""
     connectors: int
+    choose: Mapping[str, Answer]
+    """Steps of the config flow up to the port."""
     search: Mapping[str, Answer]
-    """Steps of the config flow from the port to the chargers found."""
+    """Steps from the port to the chargers found."""
+
+    @property
+    def ready(self) -> str:
+        """Return what the virtual chargers say when the port is there."""
+        return f"ready {self.virtual[0]} "
 
     def answers(self, port: str) -> dict[str, Answer]:
         """Return what to answer in the config flow."""
         return {
-            "user": {"protocol": self.protocol},
+            **self.choose,
             "port": {"device": port},
             **self.search,
             "charger": self._name,
@@ -57,6 +65,7 @@ BUSES: Final = (
         names={"01923054": "Car park north", "01923055": "Car park south"},
         currents={"Car park north": 32.0, "Car park south": 32.0},
         connectors=6,
+        choose={"user": {"protocol": "evbox"}},
         search={
             "impose": {"next_step_id": "search_addresses"},
             "search_addresses": {
@@ -74,6 +83,43 @@ BUSES: Final = (
         names={"1": "Garage", "2": "Carport", "3": "Guests"},
         currents={"Garage": 16.0, "Carport": 10.0, "Guests": 13.0},
         connectors=3,
+        choose={"user": {"protocol": "abl"}},
         search={"select": {"installation_limit": 16}},
+    ),
+    DemoBus(
+        protocol="smartevse",
+        title="SmartEVSE bus, polled",
+        virtual=(
+            *("smartevse", "--load-balance", "0", "--max-current", "16"),
+            *("--seed", "2", *_LIFE),
+        ),
+        names={"0": "Courtyard"},
+        currents={"Courtyard": 16.0},
+        connectors=1,
+        choose={
+            "user": {"protocol": "smartevse"},
+            "mode": {"next_step_id": "polled"},
+        },
+        search={"select": {"installation_limit": 16}},
+    ),
+    DemoBus(
+        protocol="smartevse_master",
+        title="SmartEVSE bus, Home Assistant as master",
+        virtual=(
+            *("smartevse", "--load-balance", "2", "3", "--max-current", "16"),
+            *("--seed", "3", *_LIFE),
+        ),
+        names={"2": "Barn left", "3": "Barn right"},
+        currents={"Barn left": 16.0, "Barn right": 16.0},
+        connectors=2,
+        choose={
+            "user": {"protocol": "smartevse"},
+            "mode": {"next_step_id": "master"},
+        },
+        search={
+            # Less than both could use: one car more or less can be seen.
+            "supply": {"supply_limit": 25, "supply_minimum": 6},
+            "select": {"installation_limit": 16},
+        },
     ),
 )

@@ -1,6 +1,6 @@
 """The dashboard "Chargers", built of the entities that are there. Pure."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
 from .listing import ListedBus, ListedCharger, Part
@@ -8,6 +8,9 @@ from .listing import ListedBus, ListedCharger, Part
 TITLE: Final = "Chargers"
 URL_PATH: Final = "evse-chargers"
 ICON: Final = "mdi:ev-station"
+BUS_ICON: Final = "mdi:source-branch"
+POWER: Final = ("power", "estimated_power")
+"""Keys of what a connector uses, measured or estimated."""
 
 FULL: Final = 12
 HALF: Final = 6
@@ -18,7 +21,10 @@ type Card = dict[str, Any]
 
 
 def dashboard(buses: Iterable[ListedBus]) -> dict[str, Any]:
-    """Return a dashboard: a section for each charger, and what has happened."""
+    """Return a dashboard: a section for each charger, and what has happened.
+
+    What the chargers of one bus share stands before them.
+    """
     buses = list(buses)
     chargers = [charger for bus in buses for charger in bus.chargers]
     view = {
@@ -40,11 +46,29 @@ def dashboard(buses: Iterable[ListedBus]) -> dict[str, Any]:
             if (connected := bus.find("connected"))
         ],
         "sections": [
-            *(_charger_section(charger) for charger in chargers),
+            *(section for bus in buses for section in _bus_sections(bus)),
             _history_section(chargers),
         ],
     }
     return {"views": [view]}
+
+
+def _bus_sections(bus: ListedBus) -> list[Card]:
+    sections = [_charger_section(charger) for charger in bus.chargers]
+    supply = _tile(
+        bus.find("shared_supply"),
+        FULL,
+        name="Shared supply",
+        icon="mdi:call-split",
+        features=[{"type": "numeric-input", "style": "slider"}],
+    )
+    if supply is None:
+        return sections
+    second = bus.find("second_master")
+    return [
+        _section([_heading(bus.name, BUS_ICON, "title", second), supply]),
+        *sections,
+    ]
 
 
 def _charger_section(charger: ListedCharger) -> Card:
@@ -70,7 +94,24 @@ def _charger_section(charger: ListedCharger) -> Card:
         if several:
             cards.append(_heading(connector.name, "mdi:ev-plug-type2", "subtitle"))
         cards += _connector_cards(connector)
+    if not _measured(charger):
+        cards.append(
+            _tile(
+                charger.find("offered_current"),
+                HALF,
+                name="Offered",
+                icon="mdi:current-ac",
+                color="amber",
+            )
+        )
     return _section(cards)
+
+
+def _measured(charger: ListedCharger) -> bool:
+    """Return whether it tells what it uses; a SmartEVSE tells what it offers."""
+    return any(
+        connector.find(*POWER) is not None for connector in charger.connectors.values()
+    )
 
 
 def _connector_cards(connector: Part) -> list[Card | None]:
@@ -84,7 +125,7 @@ def _connector_cards(connector: Part) -> list[Card | None]:
             color="green",
         ),
         _tile(
-            connector.find("power", "estimated_power"),
+            connector.find(*POWER),
             HALF,
             name="Power" if "power" in connector.entities else "Power (estimated)",
             icon="mdi:flash",
@@ -111,7 +152,7 @@ def _currents(connector: Part) -> Card | None:
     }
 
 
-def _history_section(chargers: Iterable[ListedCharger]) -> Card:
+def _history_section(chargers: Sequence[ListedCharger]) -> Card:
     parts = [
         (
             f"{charger.name} {number}" if len(charger.connectors) > 1 else charger.name,
@@ -120,11 +161,14 @@ def _history_section(chargers: Iterable[ListedCharger]) -> Card:
         for charger in chargers
         for number, connector in charger.connectors.items()
     ]
-    power = _graph(parts, ("power", "estimated_power"))
+    power = _graph(parts, POWER)
+    unmeasured = [(one.name, one) for one in chargers if not _measured(one)]
+    offered = _graph(unmeasured, ("offered_current",))
     status = _graph(parts, ("status", "charging"))
     cards = [
         _heading("The last quarter of an hour", "mdi:chart-line", "title"),
         power and {**power, "title": "Power"},
+        offered and {**offered, "title": "Offered current"},
         status and {**status, "title": "Status"},
     ]
     return _section(cards)

@@ -31,7 +31,7 @@ from demo.processes import Program
 from demo.settings import DemoError, Settings, from_environment
 from demo.storage import prepare
 
-from .virtual import AblBox, EvboxChargePoint, Module, VirtualBus
+from .virtual import AblBox, Car, EvboxChargePoint, Module, SmartEvse, VirtualBus
 
 # -- The first start, without frontend -------------------------------------------
 
@@ -46,6 +46,12 @@ async def client(
     url = str(server.make_url("")).rstrip("/")
     async with Client(url, hass_access_token) as client:
         yield client
+
+
+def _plugged() -> Car:
+    car = Car(max_current=32)
+    car.plug_in()
+    return car
 
 
 def _settings(folder: Path) -> Settings:
@@ -73,14 +79,25 @@ async def test_buses_are_added_once_and_all_is_on_the_dashboard(
         AblBox(number, serial=f"2W22xy{number:08d}", default_current=16)
         for number in (1, 2, 3)
     ]
+    polled = SmartEvse(max_current=16, car=_plugged())
+    slaves = [
+        SmartEvse(load_balance=unit, max_current=16, car=_plugged()) for unit in (2, 3)
+    ]
     with (
         VirtualBus.pty(*points, link=str(settings.link("evbox"))),
         VirtualBus.pty(*boxes, link=str(settings.link("abl"))),
+        VirtualBus.pty(polled, link=str(settings.link("smartevse"))) as single,
+        VirtualBus.pty(*slaves, link=str(settings.link("smartevse_master"))) as shared,
     ):
         await home.furnish(client, settings)
         # The chargers themselves follow what the demo begins with.
         assert [point.limits_in_force for point in points] == [(32.0,) * 3] * 2
         assert [round(box.ic_amps) for box in boxes] == [16, 10, 13]
+        await single.wait_for_async(lambda: polled.pilot_current == 16, 15)
+        # Two cars share what is there.
+        await shared.wait_for_async(
+            lambda: [slave.pilot_current for slave in slaves] == [12.5, 12.5], 15
+        )
 
         mine = {"entity_id": "number.garage_charging_current", "value": 9}
         await client.post("services/number/set_value", mine)
@@ -97,9 +114,12 @@ async def test_buses_are_added_once_and_all_is_on_the_dashboard(
             name for bus in BUSES for name in bus.names.values()
         )
         shown = _entities(dashboard(saved[0]))
-        assert {f"number.{name}_charging_current" for name in ("garage", "guests")} < (
-            shown
-        )
+        assert {
+            f"number.{name}_charging_current"
+            for name in ("garage", "guests", "courtyard", "barn_left")
+        } < shown
+        assert "sensor.courtyard_offered_current" in shown
+        assert any(entity.endswith("_shared_supply") for entity in shown)
         assert "sensor.car_park_south_module_4_power" in shown
         assert {entity for entity in shown if hass.states.get(entity) is None} == set()
         for entry in entries:
