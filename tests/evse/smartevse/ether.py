@@ -17,11 +17,9 @@ from custom_components.evse_bus.evse.framing import LineSettings
 from custom_components.evse_bus.evse.line import Line
 from custom_components.evse_bus.evse.modbus import RtuFramer
 from custom_components.evse_bus.evse.model import CurrentLimit, Orders, Supply
+from custom_components.evse_bus.evse.smartevse.config import SlaveConfig
 from custom_components.evse_bus.evse.smartevse.master import Master
-from custom_components.evse_bus.evse.smartevse.slave import (
-    SlaveConfig,
-    SlaveSmartEvse,
-)
+from custom_components.evse_bus.evse.smartevse.slave import SlaveSmartEvse
 from custom_components.evse_bus.evse.smartevse.timing import TIMING
 from tests.evse.simulated import now
 from tests.virtual import Car, SmartEvseController
@@ -252,7 +250,7 @@ class MasterScene:
         return [b - a for a, b in itertools.pairwise(times)]
 
     def frames(self, start: str, since: float = 0.0) -> list[str]:
-        """What we sent that begins like this, as hex."""
+        """Return what we sent that begins like this, as hex."""
         return [
             sent.data.hex()
             for sent in self.line.sent

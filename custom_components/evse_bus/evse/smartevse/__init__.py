@@ -5,11 +5,12 @@ from typing import Final
 from ..framing import LineSettings
 from ..modbus import RtuFramer
 from ..protocol import Protocol
-from .charger import PolledConfig, PolledSmartEvse
+from .charger import PolledSmartEvse
+from .config import PolledConfig, SlaveConfig
 from .master import Master
 from .master_scan import scan as master_scan
 from .scan import scan
-from .slave import SlaveConfig, SlaveSmartEvse
+from .slave import SlaveSmartEvse
 from .timing import TIMING
 
 SETTINGS: Final = LineSettings(baudrate=9600)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from ..model import ChargerConfig
+from .balancing import SLAVES
 from .dialects import Dialect
 from .registers import UNITS
 
@@ -54,3 +55,14 @@ def polled_config(config: ChargerConfig) -> PolledConfig:
         message = f"{config.name} is not set up as a polled SmartEVSE"
         raise TypeError(message)
     return config
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SlaveConfig(SmartEvseConfig):
+    """A SmartEVSE set up as slave 1, 2 or 3: unit 2, 3 or 4."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for an address that no slave has."""
+        if self.address not in SLAVES:
+            message = f"{self.address} is no address of a slave (2 to 4)"
+            raise ValueError(message)

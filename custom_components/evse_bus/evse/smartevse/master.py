@@ -157,7 +157,7 @@ class Master(Duty):
         ]
         idle: list[Claim] = []
         for unit, slave in slaves.items():
-            claim = slave.claim(may_draw=draws[unit].may_draw)
+            claim = slave.claim(now, may_draw=draws[unit].may_draw)
             active = draws[unit].may_draw or slave.is_promised(now)
             (claims if active else idle).append(claim)
         minimum = round(self._supply.minimum * 10)

@@ -8,7 +8,7 @@ PROTOCOLS.md, 3.
 
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from math import inf
 from typing import ClassVar, Final, override
@@ -35,14 +35,12 @@ from ..safety import Setpoint, clamp
 from ..turns import Turns, in_turns
 from .answers import ANSWER_BYTES, ANSWER_WITHIN, Answer
 from .balancing import (
-    SLAVES,
     RequestKind,
     SlaveRequest,
     acknowledge,
     decode_request,
 )
 from .box import SmartEvseBox
-from .config import SmartEvseConfig
 from .dialects import Dialect
 from .master import Master
 from .registers import Status, tenths
@@ -52,23 +50,14 @@ from .timing import LOOK_AGAIN
 
 PROMISE: Final = 10.0
 """A car that was told a current has its share kept until it begins, s."""
+STOPS_WITHIN: Final = 3.0
+"""Time in which a box that hears us stops when it is told to, s."""
 GIVE_BACK: Final = 60.0
 """What was stopped for want of supply stays stopped for so long at least, s."""
 BROADCASTS: Final = 4
 """How often a new current is broadcast until it must be read back."""
 LOOK_FOR_OTHERS: Final = 30.0
 """Pause between two looks at a box whose firmware cannot be used, s."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SlaveConfig(SmartEvseConfig):
-    """A SmartEVSE set up as slave 1, 2 or 3: unit 2, 3 or 4."""
-
-    def __post_init__(self) -> None:
-        """Raise ValueError for an address that no slave has."""
-        if self.address not in SLAVES:
-            message = f"{self.address} is no address of a slave (2 to 4)"
-            raise ValueError(message)
 
 
 class SlaveSmartEvse(SmartEvseBox):
@@ -88,6 +77,7 @@ class SlaveSmartEvse(SmartEvseBox):
         self._own_maximum: float | None = None
         self._promised_until = -inf
         self._withheld_at: float | None = None
+        self._stopping_since = inf
         self._is_ours = False
         self._confirming: OrderChange | None = None
         self._answering: dict[RequestKind, float] = {}
@@ -173,13 +163,18 @@ class SlaveSmartEvse(SmartEvseBox):
         """Return whether a current is kept for it that it does not draw yet."""
         return now < self._promised_until
 
-    def claim(self, *, may_draw: bool) -> Claim:
+    def claim(self, now: float, *, may_draw: bool) -> Claim:
         """Return what it asks of the supply."""
         wish = tenths(self.wanted)
         gone = not self.available and self.status is None
-        must_stop = wish < LOWEST or self.withheld
-        if may_draw and must_stop:
-            return Claim(unit=self.unit, wish=0, fixed=True)
+        if not may_draw or (wish >= LOWEST and not self.withheld):
+            self._stopping_since = inf
+        else:
+            # It is as good as gone, and nobody is stopped for its sake: unless it
+            # does not obey.
+            self._stopping_since = min(self._stopping_since, now)
+            disobeys = gone or now - self._stopping_since > STOPS_WITHIN
+            return Claim(unit=self.unit, wish=0, fixed=disobeys)
         if may_draw and gone:
             return Claim(unit=self.unit, wish=min(wish, LOWEST), fixed=True)
         return Claim(unit=self.unit, wish=wish, came=self.came)
@@ -365,6 +360,10 @@ class SlaveSmartEvse(SmartEvseBox):
             return Later(0.0, _nothing, 0.0)
         if request.kind in (RequestKind.B, RequestKind.C):
             self._own_maximum = request.wanted
+        else:
+            # What it leaves the others need not wait for.
+            self._promised_until = -inf
+            self._tend_soon(now)
         if now < self._answering.get(request.kind, -inf):
             return Later(0.0, _nothing, 0.0)
         self._answering[request.kind] = now + ANSWER_WITHIN
