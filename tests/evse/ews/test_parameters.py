@@ -21,12 +21,12 @@ from custom_components.evse_bus.evse.ews.parameters import (
     ExtraParameters,
     InstallationInfo,
     LockType,
-    PasswordShown,
+    Shown,
     SystemMode,
     SystemParameters,
     TimeZone,
     UserParameters,
-    password_shown,
+    shown,
 )
 
 from .wire import message
@@ -215,24 +215,27 @@ def test_a_box_without_ports_is_not_believed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("password", "shown"),
+    ("secret", "told"),
     [
-        (b"topsecret\0\0\0", PasswordShown.SHOWN),
-        (b"topsecret   ", PasswordShown.SHOWN),
-        (b"exactlytwelv", PasswordShown.SHOWN),
-        (bytes(12), PasswordShown.EMPTY),
-        (12 * b" ", PasswordShown.EMPTY),
-        (b"\0hidden\0\0\0\0\0", PasswordShown.EMPTY),
-        (12 * b"*", PasswordShown.MASKED),
-        (b"****\0\0\0\0\0\0\0\0", PasswordShown.MASKED),
-        (8 * b"x" + bytes(4), PasswordShown.MASKED),
-        (12 * b"\xff", PasswordShown.MASKED),
-        (b"\x95\x95\x94\x95" + bytes(8), PasswordShown.MASKED),
-        (b"a\x01b" + bytes(9), PasswordShown.MASKED),
+        (b"topsecret\0\0\0", Shown.SHOWN),
+        (b"topsecret   ", Shown.SHOWN),
+        (b"exactlytwelv", Shown.SHOWN),
+        (bytes(12), Shown.EMPTY),
+        (12 * b" ", Shown.EMPTY),
+        (b"\0hidden\0\0\0\0\0", Shown.EMPTY),
+        (12 * b"*", Shown.MASKED),
+        (b"****\0\0\0\0\0\0\0\0", Shown.MASKED),
+        (8 * b"x" + bytes(4), Shown.MASKED),
+        (12 * b"\xff", Shown.MASKED),
+        (b"\x95\x95\x94\x95" + bytes(8), Shown.MASKED),
+        (b"a\x01b" + bytes(9), Shown.MASKED),
+        (b"0000", Shown.SHOWN),
+        (b"****", Shown.MASKED),
+        (bytes(4), Shown.EMPTY),
     ],
 )
-def test_whether_a_password_was_read(password: bytes, shown: PasswordShown) -> None:
-    assert password_shown(password) is shown
+def test_whether_a_secret_was_read(secret: bytes, told: Shown) -> None:
+    assert shown(secret) is told
 
 
 @pytest.mark.parametrize(
@@ -260,13 +263,23 @@ def test_a_password_that_is_not_told_is_not_erased(
         assert request.parameters[:12] == password.encode().ljust(12, b"\0")
 
 
+@pytest.mark.parametrize("hidden", [b"****", bytes(4)])
+def test_a_pin_that_is_not_told_is_not_erased(hidden: bytes) -> None:
+    masked = SYSTEM[:19] + hidden + SYSTEM[23:]
+    with pytest.raises(RefusedOrderError, match="card_pin"):
+        SYSTEM_BLOCK.change(masked, {"ports": 1, "admin_password": "new"})
+    for pin in ("4711", ""):
+        request = SYSTEM_BLOCK.change(masked, {"ports": 1, "card_pin": pin})
+        assert request.parameters[19:23] == pin.encode().ljust(4, b"\0")
+
+
 def test_a_password_that_is_told_goes_back_as_it_was() -> None:
     padded = b"topsecret \x00\x7f" + SYSTEM[12:]
     assert SYSTEM_BLOCK.change(padded, {"ports": 1}).parameters[:12] == padded[:12]
 
 
 def test_no_repr_and_no_error_tells_what_is_private() -> None:
-    shown = "".join(
+    text = "".join(
         repr(block.decode(data))
         for block, data in (
             (SYSTEM_BLOCK, SYSTEM),
@@ -274,9 +287,9 @@ def test_no_repr_and_no_error_tells_what_is_private() -> None:
             (INSTALLATION_BLOCK, INSTALLATION),
         )
     )
-    shown += repr(SYSTEM_BLOCK.change(SYSTEM, {"admin_password": "newsecret"}))
+    text += repr(SYSTEM_BLOCK.change(SYSTEM, {"admin_password": "newsecret"}))
     with pytest.raises(RefusedOrderError) as caught:
         SYSTEM_BLOCK.change(SYSTEM, {"admin_password": "muchtoolongsecret"})
-    shown += str(caught.value)
+    text += str(caught.value)
     for private in ("secret", "4711", "mypass", "192.168", "Weg", "Erfurt", "0361"):
-        assert private not in shown
+        assert private not in text

@@ -72,7 +72,9 @@ VALUES: dict[type[Field[Any]], Callable[[Any], st.SearchStrategy[Any]]] = {
     Identity: lambda field: st.from_regex(
         rf"[0-9A-Za-z]{{1,{field.width}}}", fullmatch=True
     ),
-    Ascii: lambda field: st.text(_letters, min_size=field.width, max_size=field.width),
+    Ascii: lambda field: (
+        st.just("") | st.text(_letters, min_size=field.width, max_size=field.width)
+    ),
     Text: lambda field: st.text("aZ09*-.äöüßÄÖÜé", max_size=field.width),
     Raw: lambda field: st.binary(min_size=field.width, max_size=field.width),
     Address: lambda _: st.integers(0, 0xFFFFFFFF).map(IPv4Address),
@@ -184,7 +186,7 @@ CANNOT_BE_WRITTEN: list[tuple[Field[Any], list[object]]] = [
     (Bits(name="x", kind=_Lights), [1, True, _OTHER, None]),
     (Centivolts(name="x"), [15.01, -15.01, float("nan"), float("inf"), "5"]),
     (Text(name="x", width=4), ["abcde", "äöüßx", "€", "a\0b", "a\nb", b"ab", 5, None]),
-    (Ascii(name="x", width=4), ["123", "12345", "", "12 €", "ä234", 1234, "12\x003"]),
+    (Ascii(name="x", width=4), ["123", "12345", "12 €", "ä234", 1234, "12\x003"]),
     (Raw(name="x", width=2), [b"", b"1", b"123", "12", None]),
     (Address(name="x"), ["192.168.0.1", 0, None]),
     (Moment(name="x"), [datetime(2020, 1, 1, tzinfo=UTC), "2020-01-01", 0]),

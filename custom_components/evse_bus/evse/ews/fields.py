@@ -187,13 +187,13 @@ class Identity(Text):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ascii(Text):
-    """A text of ASCII signs, exactly as long as the field."""
+    """A text of ASCII signs, exactly as long as the field; empty: none."""
 
     @override
     def encode(self, value: object) -> bytes:
         if not isinstance(value, str) or not value.isascii():
             raise self.refused("is no ASCII text")
-        if len(value) != self.width:
+        if len(value) not in (0, self.width):
             raise self.refused(f"has {self.width} signs")
         return Text.encode(self, value)
 

@@ -4,9 +4,9 @@ A block is changed as it was read: its bytes stay what they are but for the fiel
 that are named, whatever the others mean. Source: manual, 3.2.4 (``sp``, ``su``,
 ``si``, ``sz``) and the table of 3.1.1.
 
-Two of the blocks begin with a password, which the box may hide when it is read; the
-manual does not say. A block whose password does not stand in it is not written,
-unless the password is named too: it would be erased.
+Two of the blocks have secrets in them (passwords, the PIN of the cards), which the box
+may hide when they are read; the manual does not say. A block whose secret does not
+stand in it is not written, unless the secret is named too: it would be erased.
 """
 
 from collections.abc import Mapping
@@ -236,8 +236,8 @@ EXTRA: Final = Struct(
 # -- Changing ----------------------------------------------------------------------
 
 
-class PasswordShown(Enum):
-    """What stands where a block has its password."""
+class Shown(Enum):
+    """What stands where a block has a secret."""
 
     SHOWN = "shown"
     EMPTY = "empty"
@@ -246,15 +246,15 @@ class PasswordShown(Enum):
     """One sign over and over, or no readable text."""
 
 
-def password_shown(password: bytes) -> PasswordShown:
-    """Return whether a password was read as it is set (12 bytes)."""
-    text = password.split(b"\0", 1)[0].rstrip(b" ")
+def shown(secret: bytes) -> Shown:
+    """Return whether a password or PIN was read as it is set."""
+    text = secret.split(b"\0", 1)[0].rstrip(b" ")
     if not text:
-        return PasswordShown.EMPTY
+        return Shown.EMPTY
     readable = text.isascii() and text.decode("latin-1").isprintable()
-    # Nobody who sets one takes twelve equal signs; a mask does.
-    alike = len(set(text)) == 1
-    return PasswordShown.MASKED if alike or not readable else PasswordShown.SHOWN
+    # 0000 is a PIN that people have; stars and the like are a mask.
+    mask = len(set(text)) == 1 and not text.isdigit()
+    return Shown.MASKED if mask or not readable else Shown.SHOWN
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -264,8 +264,8 @@ class Block[T]:
     read: CommandId
     write: CommandId
     struct: Struct[T]
-    password: str | None = None
-    """Name of the field with the password, always the first one."""
+    secrets: frozenset[str] = frozenset()
+    """Names of the fields that a box may hide."""
 
     def decode(self, data: bytes) -> T:
         """Return what the answer to the read says; raises ImplausibleReplyError."""
@@ -275,23 +275,26 @@ class Block[T]:
         """Return the command that writes a block just read, with these changes.
 
         Raises RefusedOrderError for a field or value that cannot be, for nothing to
-        change, and where the password would be erased; ImplausibleReplyError for
+        change, and where a secret would be erased; ImplausibleReplyError for
         bytes that are no such block.
         """
         if not changes:
             message = f"{self.struct.source}: nothing to change"
             raise RefusedOrderError(message)
         changed = self.struct.changed(data, changes)
-        if self.password is not None and self.password not in changes:
-            self._check_password(self.struct.fields[0], data)
+        at = 0
+        for known in self.struct.fields:
+            if known.name in self.secrets - changes.keys():
+                self._check(known, data[at : at + known.width])
+            at += known.width
         return Request(self.write, changed)
 
-    def _check_password(self, known: Field[object], data: bytes) -> None:
-        shown = password_shown(data[: known.width])
-        if shown is not PasswordShown.SHOWN:
+    def _check(self, known: Field[object], secret: bytes) -> None:
+        told = shown(secret)
+        if told is not Shown.SHOWN:
             message = (
-                f"{self.struct.source}: the box tells no {known.name} ({shown.value}); "
-                "writing would erase it unless it is named as well"
+                f"{self.struct.source}: the box does not tell {known.name} "
+                f"({told.value}); writing would erase it unless it is named as well"
             )
             raise RefusedOrderError(message)
 
@@ -300,14 +303,14 @@ SYSTEM_BLOCK: Final = Block(
     read=CommandId.READ_SYSTEM,
     write=CommandId.WRITE_SYSTEM,
     struct=SYSTEM,
-    password="admin_password",  # noqa: S106 - the name of a field
+    secrets=frozenset({"admin_password", "card_pin"}),
 )
 """Not written while the box starts or a car charges; it starts anew afterwards."""
 USER_BLOCK: Final = Block(
     read=CommandId.READ_USER,
     write=CommandId.WRITE_USER,
     struct=USER,
-    password="user_password",  # noqa: S106 - the name of a field
+    secrets=frozenset({"user_password"}),
 )
 INSTALLATION_BLOCK: Final = Block(
     read=CommandId.READ_INSTALLATION,
