@@ -6,10 +6,9 @@ more. PROTOCOLS.md, 3.
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Final, override
 
-from ..errors import GarbledReplyError, NotConfirmedError
+from ..errors import GarbledReplyError, NotConfirmedError, SupersededError
 from ..exchange import Request, Talk
 from ..jobs import Later, Step
 from ..model import ChargerConfig, Fault, Orders, Range, Setting
@@ -114,21 +113,31 @@ class SmartEvseBox(SmartEvseReader):
 
     # -- Access ----------------------------------------------------------------------
 
-    async def set_access(self, talk: Talk, allowed: bool) -> Turns:  # noqa: FBT001
+    async def set_access(
+        self,
+        talk: Talk,
+        allowed: bool,  # noqa: FBT001
+        still: Callable[[], bool] = lambda: True,
+    ) -> Turns:
         """Set the access bit until the box is read back to have obeyed.
 
-        Off counts when no car can charge any more (`states.is_stopped`). Raises
-        NotConfirmedError when the box does not follow.
+        Off counts when no car can charge any more (`states.is_stopped`). ``still`` is
+        asked right before each write: a pause said meanwhile must not be overtaken.
+        Raises SupersededError where it says no, NotConfirmedError when the box does
+        not follow.
         """
         async for pause in self.reach(talk):
             yield pause
         dialect = self.known_dialect
+
+        def request() -> bytes:
+            if not still():
+                message = "a newer command came first"
+                raise SupersededError(message)
+            return write_access(self.config.address, dialect, allowed)
+
         for _ in range(WRITES):
-            await self.write(
-                talk,
-                partial(write_access, self.config.address, dialect, allowed),
-                MAPS[dialect].access_register,
-            )
+            await self.write(talk, request, MAPS[dialect].access_register)
             for pause in (0.0, LOOK_AGAIN):
                 yield pause
                 async for wait in self.see(talk):

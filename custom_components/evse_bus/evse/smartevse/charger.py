@@ -302,10 +302,12 @@ class PolledSmartEvse(PolledBox):
         yield 0.0
         if not self._may_start(change):
             return
-        if wanted().paused:
-            # Lowered to a pause while we were at it; that one is on its way.
-            return
-        async for pause in self.set_access(talk, allowed=True):
+
+        def still() -> bool:
+            # Not where a pause came meanwhile: that one is on its way.
+            return not wanted().paused
+
+        async for pause in self.set_access(talk, allowed=True, still=still):
             yield pause
         self._limit_paused = False
 
