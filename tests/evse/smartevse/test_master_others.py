@@ -1,0 +1,227 @@
+"""Another master, other dialects, and the scan, under our own master."""
+
+import asyncio
+
+import pytest
+
+from custom_components.evse_bus.evse.bus import Bus
+from custom_components.evse_bus.evse.errors import NotAvailableError, RefusedOrderError
+from custom_components.evse_bus.evse.model import (
+    Fault,
+    OrderChange,
+    ScanReport,
+    Supply,
+)
+from custom_components.evse_bus.evse.smartevse import MASTER
+from custom_components.evse_bus.evse.smartevse.master import OTHERS, Master
+from tests.evse.simulated import now, simulate
+from tests.evse.smartevse.ether import MasterScene
+
+FOREIGN = bytes.fromhex("001000010004080064003c00000000ff7a")
+READ = bytes.fromhex("040400a00009307b")
+
+
+async def scan(bus: Bus, scene: MasterScene) -> ScanReport:
+    config, orders = scene.make(2).config, scene.make(2).orders
+    return await MASTER.scan(bus, config, orders, lambda _share: None)
+
+
+def test_another_master_is_heard_before_our_first_word() -> None:
+    async def scene() -> None:
+        async with MasterScene() as scene:
+            told: list[frozenset[Fault]] = []
+            scene.master.subscribe(lambda: told.append(scene.master.noticed))
+            await asyncio.sleep(2.3)
+            scene.line.say(FOREIGN)
+            await asyncio.sleep(OTHERS - 1)
+            assert scene.line.sent == []
+            assert told == [frozenset({Fault.SECOND_MASTER})]
+            await asyncio.sleep(5)
+            assert scene.broadcasts()
+            assert told[-1] == frozenset()
+
+    simulate(scene())
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        "001000010004080064003c00000000ff7a",
+        "0910000100081000640000000000000000000000000000",
+        "0910002000081000640000000000000000000000000000",
+    ],
+)
+def test_another_master_silences_us_at_once_and_for_good(frame: str) -> None:
+    async def scene() -> None:
+        async with MasterScene() as scene:
+            await asyncio.sleep(6)
+            assert scene.slave(2).available
+            data = bytes.fromhex(frame)
+            data = data if data[0] == 0 else data + crc(data)
+            await scene.until(lambda: now() > scene.line.busy_until + 0.01)
+            scene.line.say(data)
+            await asyncio.sleep(0.005)
+            waiting = asyncio.create_task(
+                scene.slave(2).change_orders(OrderChange(current=9.0))
+            )
+            for _ in range(50):
+                await asyncio.sleep(2)
+                scene.line.say(data)
+            heard = now() - 100
+            with pytest.raises(NotAvailableError, match="another master"):
+                await waiting
+            with pytest.raises(NotAvailableError, match="another master"):
+                await scene.slave(2).change_orders(OrderChange(allowed=False))
+            late = [s for s in scene.line.sent if s.when > heard + 0.4]
+            assert late == []
+            assert scene.master.noticed == {Fault.SECOND_MASTER}
+            assert not scene.slave(2).available
+            # Requests of the slaves are its business, too.
+            scene.line.say(bytes.fromhex("020600030082f998"))
+            await asyncio.sleep(OTHERS - 5)
+            assert [s for s in scene.line.sent if s.when > heard + 0.4] == []
+            await asyncio.sleep(10)
+            assert scene.master.noticed == frozenset()
+            assert scene.slave(2).available
+            # The lowering was said, and stands.
+            assert scene.slave(2).orders.limit.current == 9
+
+    simulate(scene())
+
+
+@pytest.mark.parametrize("late", [0.02, 0.3])
+def test_our_own_echo_is_no_other_master(late: float) -> None:
+    """An adapter that hears itself, also one that hands its echo on late."""
+
+    async def scene() -> None:
+        async with MasterScene(units=(2,)) as scene:
+            await asyncio.sleep(6)
+            line = scene.line
+            write = line.write
+            loop = asyncio.get_running_loop()
+
+            def echoing(data: bytes, *, reply_may_equal: bool = False) -> float:
+                end = write(data, reply_may_equal=reply_may_equal)
+                if data[0] == 0:
+                    loop.call_at(end + late, line.noise, data)
+                return end
+
+            line.write = echoing  # type: ignore[method-assign]
+            await asyncio.sleep(60)
+            assert scene.master.noticed == frozenset()
+            assert max(scene.gaps()) < 2.1
+
+    simulate(scene())
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        "001000010004",  # the answer to a broadcast, of a box without load balancing
+        "040600030082",  # a slave that is not set up
+        "020600830050",  # somebody's acknowledgement
+        "0a0400000028",
+        "000600020001",
+    ],
+)
+def test_other_frames_are_no_master(frame: str) -> None:
+    async def scene() -> None:
+        async with MasterScene() as scene:
+            await asyncio.sleep(6)
+            data = bytes.fromhex(frame)
+            scene.line.noise(data + crc(data))
+            await asyncio.sleep(6)
+            assert scene.master.noticed == frozenset()
+            assert max(scene.gaps()) < 2.1
+
+    simulate(scene())
+
+
+@pytest.mark.parametrize("dialect", ["2.20", "later"])
+def test_another_dialect_is_not_written_to(dialect: str) -> None:
+    async def scene() -> None:
+        async with MasterScene(units=(2,)) as scene:
+            scene.plug_box(3, dialect)
+            slave = scene.add(3)
+            await asyncio.sleep(100)
+            assert Fault.UNSUPPORTED_FIRMWARE in slave.faults
+            assert slave.reading is None
+            assert not slave.available
+            with pytest.raises(NotAvailableError, match="firmware"):
+                await slave.change_orders(OrderChange(current=10.0))
+            assert {s.data[1] for s in scene.line.sent if s.data[0] == 3} <= {3, 4}
+            # It takes nothing of the supply, and has no word.
+            assert {s.words[2] for s in scene.broadcasts()} == {0}
+            await scene.charge(2)
+            await asyncio.sleep(3)
+            assert scene.offers == 16
+
+    simulate(scene())
+
+
+def test_the_scan_only_reads_and_says_what_cannot_be_used() -> None:
+    async def scene() -> None:
+        async with MasterScene(units=()) as scene:
+            scene.plug_box(2)
+            scene.plug_box(4, "later")
+            begin = now()
+            report = await scan(scene.bus, scene)
+            assert [one.address for one in report.found] == [2]
+            assert report.found[0].info.firmware == "2.17"
+            assert [one.address for one in report.unsupported] == [4]
+            assert not report.other_master
+            assert {sent.data[1] for sent in scene.line.sent} <= {3, 4}
+            assert scene.line.sent[0].when - begin >= 2.5
+
+    simulate(scene())
+
+
+def test_the_scan_beside_another_master_says_so_and_nothing_else() -> None:
+    async def scene() -> None:
+        async with MasterScene(units=()) as scene:
+            scene.plug_box(2)
+            looking = asyncio.create_task(scan(scene.bus, scene))
+            await asyncio.sleep(1)
+            scene.line.say(FOREIGN)
+            assert await looking == ScanReport(other_master=True)
+            assert scene.line.sent == []
+            assert await scan(scene.bus, scene) == ScanReport(other_master=True)
+
+    simulate(scene())
+
+
+def test_a_scan_of_a_running_bus_holds_no_broadcast_up() -> None:
+    async def scene() -> None:
+        async with MasterScene(units=(2,)) as scene:
+            scene.plug_box(3)
+            await asyncio.sleep(6)
+            for _ in range(5):
+                report = await scan(scene.bus, scene)
+                assert [one.address for one in report.found] == [2, 3]
+            assert max(scene.gaps()) <= 2.02
+
+    simulate(scene())
+
+
+@pytest.mark.parametrize(
+    "supply",
+    [
+        Supply(limit=float("nan")),
+        Supply(limit=-1.0),
+        Supply(minimum=5.0),
+        Supply(minimum=81.0),
+        Supply(limit=16, minimum=float("inf")),
+    ],
+)
+def test_a_supply_that_cannot_be_is_refused(supply: Supply) -> None:
+    with pytest.raises(RefusedOrderError):
+        Master(supply)
+
+
+def crc(data: bytes) -> bytes:
+    value = 0xFFFF
+    for byte in data:
+        value ^= byte
+        for _ in range(8):
+            value = value >> 1 ^ 0xA001 if value & 1 else value >> 1
+    return value.to_bytes(2, "little")
