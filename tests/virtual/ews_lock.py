@@ -54,6 +54,9 @@ class LockMotor:
         if self.target is None or now < self._done_at:
             return ""
         target, self.target = self.target, None
+        if target == self.locked:
+            # Called back on its way: it never got anywhere.
+            return "locked" if target else ""
         if self.jammed == ("lock" if target else "unlock"):
             return "failed"
         self.locked = target

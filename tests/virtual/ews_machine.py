@@ -132,8 +132,8 @@ class PortMachine:
     def step(self, now: float) -> None:
         """Live until now."""
         self._now = now
-        self._cable_moves()
         ended = self.lock.step(now)
+        self._cable_moves()
         if ended:
             self._lock_ended(ended)
         for _ in range(STEPS):
@@ -193,6 +193,8 @@ class PortMachine:
             self._idle()
         elif status != Status.RCD:
             self._over_or_stuck()
+        elif self.relay.closed and self.relay.open():
+            self.unlock("RCD")
 
     def _over_or_stuck(self) -> None:
         if self.status == Status.CONTACTOR_OFF_ERROR:
@@ -207,9 +209,14 @@ class PortMachine:
             self._end(Status.ENDED, Result.PILOT_LOST, "pilot lost")
 
     def _initialising(self) -> None:
+        opened = self.relay.open()
         if self._init_until is None or self._now < self._init_until:
             return
         self._init_until = None
+        if not opened:
+            self._restart = False
+            self._go(Status.CONTACTOR_OFF_ERROR)
+            return
         self._go(Status.NOT_CONNECTED)
         if self._restart and self.cable_in:
             self.release_start("power failure")
@@ -227,7 +234,8 @@ class PortMachine:
             self.start_mode = 0
             self._go(Status.RCD)
         else:
-            self._go(self._after_rcd or Status.NOT_CONNECTED)
+            after = self._after_rcd or Status.NOT_CONNECTED
+            self._go(Status.CONTACTOR_OFF_ERROR if self.contactor else after)
 
     def _idle(self) -> None:
         status = self._idle_status()

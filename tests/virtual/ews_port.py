@@ -66,7 +66,7 @@ class EwsPort(PortMachine):
         self._now = now
         self._restart = restart and self.active
         self.relay.open()
-        if self.lock.locked and mains:
+        if self.lock.locked and mains and not self.contactor:
             self._unlocked("power failure")
             self.lock.spring_open()
         if self.active:
@@ -98,7 +98,7 @@ class EwsPort(PortMachine):
 
     def lock_manually(self) -> None:
         """Lock (`sl` 7)."""
-        if self.has_lock:
+        if self.has_lock and (not self.lock.locked or self.lock.moving):
             self.lock.drive(locked=True, now=self._now, reason="sl 7")
 
     def abort(self, result: int, reason: str) -> None:
