@@ -9,13 +9,14 @@ another master speaks. Source: PROTOCOLS.md, 3.
 import asyncio
 from contextlib import suppress
 from enum import Enum, auto
+from functools import partial
 import logging
 from math import inf
 from typing import TYPE_CHECKING, Final, cast, override
 
 from ..duty import Duty
-from ..errors import LineBusyError, RefusedOrderError
-from ..exchange import Talk
+from ..errors import LineBusyError, NotAvailableError, RefusedOrderError
+from ..exchange import Request, Talk
 from ..framing import Frame
 from ..modbus import ModbusFrame
 from ..model import MAXIMUM_CURRENT, MINIMUM_CURRENT, Fault, Supply
@@ -262,7 +263,7 @@ class Master(Duty):
         Nothing is said before we have looked at the slaves.
         """
         if self._phase is _Phase.SPEAKING:
-            await talk.send(self.frame)
+            await talk.send(partial(self.unless_silent, self.frame))
 
     @override
     async def turn(self, talk: Talk) -> None:
@@ -306,7 +307,7 @@ class Master(Duty):
 
     @override
     def failed(self, now: float) -> None:
-        if not self._is_planned:
+        if not self._is_planned and not self.silent:
             self._plan(now + RETRY, now + RETRY)
         self._is_planned = False
 
@@ -321,6 +322,15 @@ class Master(Duty):
     @override
     def refusal(self) -> str | None:
         return _OTHER_MASTER if self._phase is _Phase.HUSHED else None
+
+    def unless_silent(self, request: Request) -> bytes:
+        """Return what is to be sent; NotAvailableError where another master spoke.
+
+        Asked when the line is quiet: what was under way must not go out either.
+        """
+        if self.silent:
+            raise NotAvailableError(_OTHER_MASTER)
+        return request() if callable(request) else request
 
     @override
     def on_line_open(self, now: float) -> None:

@@ -17,7 +17,7 @@ from ..errors import (
     NotAvailableError,
     NotConfirmedError,
 )
-from ..exchange import Talk
+from ..exchange import Request, Talk
 from ..framing import Frame
 from ..jobs import Later
 from ..modbus import ModbusFrame
@@ -41,9 +41,9 @@ from .balancing import (
     decode_request,
 )
 from .box import SmartEvseBox
-from .dialects import Dialect
+from .dialects import Block, Dialect
 from .master import Master
-from .registers import Status, tenths
+from .registers import Status, read_answer, read_request, tenths
 from .sharing import LOWEST, Claim
 from .states import CHARGING, is_stopped
 from .timing import LOOK_AGAIN
@@ -211,6 +211,18 @@ class SlaveSmartEvse(SmartEvseBox):
         if self.is_foreign and talk.now < self._look_again_at:
             raise self._refusal()
         return await super().poll(talk)
+
+    @override
+    async def read(self, talk: Talk, block: Block) -> bytes:
+        request = partial(read_request, self.unit, block)
+        return await talk.exchange(
+            partial(self.master.unless_silent, request), read_answer(self.unit, block)
+        )
+
+    @override
+    async def write(self, talk: Talk, request: Request, register: int) -> bool | None:
+        checked = partial(self.master.unless_silent, request)
+        return await super().write(talk, checked, register)
 
     @override
     async def _find_dialect(self, talk: Talk) -> Turns:
@@ -383,7 +395,13 @@ class SlaveSmartEvse(SmartEvseBox):
         return not self.wanted.paused and not self.withheld and not self._is_ours
 
     def answer_frame(self, request: SlaveRequest) -> bytes:
-        """Return the answer of this moment, which must be sent now."""
+        """Return the answer of this moment, which must be sent now.
+
+        Raises NotAvailableError where another master has just spoken.
+        """
+        return self.master.unless_silent(partial(self._answer, request))
+
+    def _answer(self, request: SlaveRequest) -> bytes:
         if request.kind not in (RequestKind.B, RequestKind.C) or not self.may_begin():
             return acknowledge(request, None)
         now = self.master.now
