@@ -1,0 +1,53 @@
+"""A polled SmartEVSE end to end: a real line, a virtual box, real time."""
+
+import asyncio
+from collections.abc import Callable
+
+import pytest
+
+from custom_components.evse_bus.evse.model import CurrentLimit, OrderChange, Orders
+from custom_components.evse_bus.evse.smartevse import POLLED
+from custom_components.evse_bus.evse.smartevse.charger import PolledConfig
+from custom_components.evse_bus.evse.smartevse.dialects import Dialect
+from tests.virtual import Car, SmartEvse, VirtualBus
+
+from .polled import V2_17
+
+SCALE = 10.0
+
+
+async def until(holds: Callable[[], object]) -> None:
+    async with asyncio.timeout(10):
+        while not holds():  # noqa: ASYNC110 - what changes has nobody to tell
+            await asyncio.sleep(0.01)
+
+
+@pytest.mark.parametrize("dialect", [V2_17])
+async def test_a_charge(dialect: Dialect) -> None:
+    car = Car(max_current=32.0)
+    box = SmartEvse(dialect.value, car=car, max_current=16)
+    with VirtualBus.pty(box, baud=9600, parity="N", time_scale=SCALE) as virtual:
+        bus = POLLED.bus(virtual.url)
+        charger = POLLED.charger(
+            PolledConfig(
+                key="box",
+                name="the box",
+                address=box.unit,
+                installation_limit=20.0,
+                poll_interval=0.2,
+            ),
+            Orders(limit=CurrentLimit(current=10.0)),
+        )
+        bus.add(charger)
+        async with bus:
+            await charger.wait_available(5)
+            car.plug_in()
+            await until(lambda: box.contactor and box.pilot_current == 10)
+            await charger.change_orders(OrderChange(current=13.0))
+            assert box.pilot_current == 13
+            await charger.change_orders(OrderChange(allowed=False))
+            assert not box.contactor
+            assert not box.access
+            await charger.change_orders(OrderChange(allowed=True))
+            assert box.access
+        assert bus.wire.statistics.bad_frames == 0
