@@ -138,6 +138,20 @@ def test_a_record_at_every_byte_of_an_answer(*, counts_id: bool) -> None:
             assert (framer.bad, framer.noise, framer.pending) == (0, 0, 0)
 
 
+@pytest.mark.parametrize("at", [40, 60, len(STATUS) - 8])
+def test_a_checksum_that_is_right_by_chance_with_a_record_inside(at: int) -> None:
+    misread = 0
+    for chance in range(256):
+        # A byte of the time of this charge.
+        status = answer("rc", PORTS[:7] + bytes((chance,)) + PORTS[8:])
+        stream = status[:at] + INFO + status[at:]
+        begun = stream[: len(status)]
+        misread += reduce(xor, begun[1:]) == 0
+        for chunks in ([stream], single(stream), [begun, stream[len(begun) :]]):
+            assert sorted(raws(feed(*chunks)[0])) == sorted([INFO, status])
+    assert misread == 1
+
+
 @given(_answers, st.binary(min_size=9, max_size=9), st.data())
 def test_a_record_never_changes_an_answer(
     wire: bytes, content: bytes, data: st.DataObject
