@@ -23,7 +23,7 @@ type Card = dict[str, Any]
 def dashboard(buses: Iterable[ListedBus]) -> dict[str, Any]:
     """Return a dashboard: a section for each charger, and what has happened.
 
-    What the chargers of one bus share stands before them.
+    Chargers that share what there is have one section with that.
     """
     buses = list(buses)
     chargers = [charger for bus in buses for charger in bus.chargers]
@@ -54,7 +54,6 @@ def dashboard(buses: Iterable[ListedBus]) -> dict[str, Any]:
 
 
 def _bus_sections(bus: ListedBus) -> list[Card]:
-    sections = [_charger_section(charger) for charger in bus.chargers]
     supply = _tile(
         bus.find("shared_supply"),
         FULL,
@@ -63,15 +62,16 @@ def _bus_sections(bus: ListedBus) -> list[Card]:
         features=[{"type": "numeric-input", "style": "slider"}],
     )
     if supply is None:
-        return sections
-    second = bus.find("second_master")
-    return [
-        _section([_heading(bus.name, BUS_ICON, "title", second), supply]),
-        *sections,
+        return [_section(_charger_cards(charger)) for charger in bus.chargers]
+    cards = [
+        _heading(bus.name, BUS_ICON, "title", bus.find("second_master")),
+        supply,
+        *(card for charger in bus.chargers for card in _charger_cards(charger)),
     ]
+    return [_section(cards)]
 
 
-def _charger_section(charger: ListedCharger) -> Card:
+def _charger_cards(charger: ListedCharger) -> list[Card | None]:
     cards = [
         _heading(charger.name, ICON, "title", charger.find("problem")),
         _tile(
@@ -104,7 +104,7 @@ def _charger_section(charger: ListedCharger) -> Card:
                 color="amber",
             )
         )
-    return _section(cards)
+    return cards
 
 
 def _measured(charger: ListedCharger) -> bool:
