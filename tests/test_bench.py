@@ -6,9 +6,19 @@ import json
 from hypothesis import given, strategies as st
 import pytest
 
+from benchmarks.balancing import (
+    Shared,
+    broadcasts,
+    longest_silence,
+    on_plan,
+    requests,
+    sums,
+)
 from benchmarks.blocks import watch
 from benchmarks.figures import Figure, gaps, percentile, results, table
+from benchmarks.offers import Offer
 from benchmarks.responder import _answer
+from benchmarks.set_points import Called, offered_after
 from benchmarks.set_value import _seen
 from benchmarks.witness import Heard
 from custom_components.evse_bus.evse.modbus import AsciiFramer
@@ -97,6 +107,121 @@ def test_call_is_found_in_the_log() -> None:
     assert call.limit == pytest.approx(0.55)
     assert call.in_progress == pytest.approx(0.3)
     assert call.rest == pytest.approx(0.05)
+
+
+# -- Load balancing ----------------------------------------------------------------
+
+BROADCAST = "001000010004080064003c00000000ff7a"
+"""As recorded."""
+
+
+def _heard(start: float, data: str, *, by_us: bool = True, hit: bool = False) -> Heard:
+    raw = bytes.fromhex(data)
+    return Heard(start, start + 0.01, from_client=by_us, data=raw, collided=hit)
+
+
+def test_broadcasts_are_found_in_the_log() -> None:
+    log = [
+        _heard(1.0, BROADCAST),
+        _heard(2.0, BROADCAST, by_us=False),
+        _heard(3.0, "001000a6000102008cb2a3"),
+        _heard(4.0, "020400a00009301d"),
+        _heard(5.0, BROADCAST[:-2] + "7b"),
+        _heard(6.0, BROADCAST),
+    ]
+    assert broadcasts(log) == [1.0, 6.0]
+    assert longest_silence([1.0, 6.0], 7.0) == 5.0
+    assert longest_silence([], 7.0) == 0.0
+
+
+def test_what_is_due_is_told_from_what_comes_between() -> None:
+    times = [9.9, 10.01, 11.0, 12.0, 12.1, 14.5, 15.0, 19.0]
+    # At 16 there was none, and the next one is late for 16 and for 18.
+    assert on_plan(times, 10.0) == [
+        (10.01, pytest.approx(0.01)),
+        (12.0, 0.0),
+        (14.5, pytest.approx(0.5)),
+        (19.0, pytest.approx(3.0)),
+        (19.0, pytest.approx(1.0)),
+    ]
+    assert on_plan([], 10.0) == []
+
+
+def test_requests_and_their_answers_are_found() -> None:
+    asks, granted = "020600020082a858", "02060082003c29c0"
+    log = [
+        _heard(1.0, asks, by_us=False),
+        # What another box owed us is said first; then the bus is idle.
+        _heard(1.016, "010400a00009302e", by_us=False),
+        _heard(1.036, granted),
+        _heard(5.0, asks, by_us=False, hit=True),
+        # Too late for the first one, in time for the second.
+        _heard(6.0, asks, by_us=False),
+        _heard(6.5, BROADCAST),
+        _heard(6.7, granted),
+    ]
+    first, second, third = requests(log)
+    assert (first.unit, first.register, first.garbled) == (2, 2, False)
+    assert first.end == pytest.approx(1.01)
+    assert first.idle == pytest.approx(1.026)
+    assert first.answered == 1.036
+    assert (second.answered, second.garbled) == (None, True)
+    assert (third.idle, third.answered) == (pytest.approx(6.01), 6.7)
+
+
+def _offer(at: float, name: str, amps: float, *, closed: bool = True) -> Offer:
+    return Offer(at, name, amps, closed)
+
+
+def test_a_sum_that_rises_above_the_supply_is_a_violation() -> None:
+    shared = [Shared(0.0, 20.0)]
+    offers = [
+        _offer(1.0, "a", 10.0),
+        # An open contactor carries nothing.
+        _offer(2.0, "b", 16.0, closed=False),
+        _offer(3.0, "b", 10.0),
+        # Up and down by the same frame: one moment.
+        _offer(4.0, "a", 14.0),
+        _offer(4.001, "b", 6.0),
+    ]
+    found = sums(offers, shared, 10.0)
+    assert (found.most, found.violations, found.longest) == (20.0, 0, 0.0)
+    found = sums([*offers, _offer(5.0, "b", 6.1)], shared, 10.0)
+    assert (found.most, found.violations) == (pytest.approx(20.1), 1)
+    # Not in the same moment: up before the other one is down.
+    offers[-1] = _offer(4.1, "b", 6.0)
+    assert sums(offers, shared, 10.0).violations == 1
+
+
+def test_a_lowered_supply_is_no_violation_but_takes_time() -> None:
+    shared = [Shared(0.0, 32.0), Shared(5.0, 12.0)]
+    offers = [
+        _offer(1.0, "a", 10.0),
+        _offer(1.0, "b", 10.0),
+        # On its way when the supply was lowered.
+        _offer(5.01, "a", 16.0),
+        _offer(5.1, "a", 6.0),
+        _offer(5.5, "b", 6.0),
+    ]
+    found = sums(offers, shared, 10.0)
+    assert (found.most, found.violations) == (26.0, 0)
+    assert found.longest == pytest.approx(0.5)
+    # One goes up although the sum is too much already; and it stays so.
+    worse = [*offers[:4], _offer(5.2, "b", 11.0)]
+    found = sums(worse, shared, 10.0)
+    assert (found.violations, found.longest) == (1, pytest.approx(5.0))
+
+
+def test_an_offer_after_a_set_point_is_found() -> None:
+    offers = [
+        _offer(1.0, "a", 6.0),
+        _offer(2.5, "b", 6.0),
+        _offer(3.0, "a", 16.0),
+        _offer(3.5, "a", 6.0, closed=False),
+        _offer(4.0, "a", 6.0),
+    ]
+    assert offered_after(Called("a", 6.0, 2.0, 2.1), offers) == 2.0
+    assert offered_after(Called("a", 6.0, 4.5, 4.6), offers) is None
 
 
 async def test_blocks_are_timed_and_the_loop_left_as_it_was() -> None:
