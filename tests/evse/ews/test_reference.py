@@ -1,0 +1,40 @@
+"""The documentation has every command, what makes it, and what tests it."""
+
+from importlib import import_module
+from pathlib import Path
+import re
+
+import pytest
+
+from custom_components.evse_bus.evse.ews.frames import CommandId
+from custom_components.evse_bus.evse.ews.states import RULES, STATES
+
+PAGE = (Path(__file__).parents[3] / "docs/ews.md").read_text()
+ROWS = {
+    cells[0].strip("`"): cells
+    for line in PAGE.splitlines()
+    if line.startswith("| `")
+    and len(cells := [cell.strip() for cell in line.strip("|").split("|")]) == 7
+}
+LIBRARY = "custom_components.evse_bus.evse.ews"
+
+
+def test_every_command_has_its_row() -> None:
+    assert list(ROWS) == [*CommandId, "I if"]
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_a_row_names_what_there_is(name: str) -> None:
+    *_, code, test = ROWS[name]
+    module, what = code.strip("`").split(".")
+    assert hasattr(import_module(f"{LIBRARY}.{module}"), what)
+    module, what = test.strip("`").split(".")
+    assert hasattr(import_module(f"tests.evse.ews.{module}"), what)
+
+
+def test_every_state_and_every_order_is_told() -> None:
+    for code in STATES:
+        assert f"0x{code:02X}" in PAGE or code in range(0x40, 0x44)
+    orders = PAGE.split("## What may be ordered when")[1].split("\n## ")[0]
+    told = re.findall(r"^\| ([1-7])(?:, ([1-7]))?", orders, re.MULTILINE)
+    assert [int(one) for pair in told for one in pair if one] == [*RULES]
