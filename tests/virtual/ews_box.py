@@ -56,6 +56,8 @@ class EwsBox(EwsHands):
     - `mode`, `rfid`, `manual_io`, `exclusive`: the system mode; see also `system`,
       `user`, `user_info`, `extra`, `cards`: the stored parameters
     - `masking`: how `rp` and `ru` hide passwords; `bcc`: how it counts the BCC
+    - `ignores_limits`: takes an `st` without effect; `clamps_limits`: takes one that is
+      too high as the highest possible; `unanswered`: names that get no answer
     - `restart_flag_until`: what takes bit 0 of `rs` away: "read", "clock" or "never"
     """
 
@@ -104,7 +106,7 @@ class EwsBox(EwsHands):
         self.lease = 0
         self.rd_extra = b""
         self.clock_survives = False
-        self.ignores_limits = False
+        self.ignores_limits = self.clamps_limits = False
         self.unanswered: set[str] = set()
         self.system = SystemParameters.of(
             server=mode == "server",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from . import ews_status
 from .ews_hands import ROM_SIZE
-from .ews_orders import Code, obey
+from .ews_orders import START, Code, obey
 from .ews_parameters import LOWEST_CURRENT, OK, REFUSED
 from .ews_states import Status
 
@@ -118,8 +118,13 @@ def control(box: EwsBox, parameters: bytes) -> bytes:
     """`sl`: car, order."""
     if len(parameters) != 2 or parameters[0] not in (1, 2):
         return code(Code.NO_SUCH_CAR)
-    port = box.ports[parameters[0] - 1]
-    return code(obey(port, parameters[1], box.user_interface.press_start))
+    number, order = parameters
+    port = box.ports[number - 1]
+    answer = obey(port, order, box.user_interface.press_start)
+    if order == START and answer == Code.OK and port.session.card is None:
+        # "beim Starten auf den aktuellen Ladeport uebertragen" (3.1.6).
+        port.session.card = box.reader.noted if box.reader.valid else None
+    return code(answer)
 
 
 def write_system(box: EwsBox, parameters: bytes) -> bytes:
@@ -138,8 +143,10 @@ def limit_current(box: EwsBox, parameters: bytes) -> bytes:
         return code(REFUSED)
     number, amps = parameters
     port = box.ports[number - 1]
+    if box.clamps_limits:
+        amps = min(amps, port.ceiling)
     accepted = amps == 0 or LOWEST_CURRENT <= amps <= port.ceiling
-    box.limit_sent(number, amps, accepted=accepted)
+    box.limit_sent(number, parameters[1], accepted=accepted)
     if not accepted:
         return code(REFUSED)
     if not box.ignores_limits:

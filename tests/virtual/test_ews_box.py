@@ -151,6 +151,12 @@ def test_a_limit() -> None:
         assert client.limit(2, 6) == 0
         assert box.ports[0].limit == 0
         assert client.ports()[1]["offered"] == 6
+        box.clamps_limits = True
+        assert client.limit(1, 32) == 0
+        assert box.ports[0].limit == 16
+        box.ignores_limits = True
+        assert client.limit(1, 6) == 0
+        assert box.ports[0].limit == 16
     told = [(limit.port, limit.amps, limit.accepted) for limit in box.currents_set]
     assert told[:3] == [(1, 6, True), (1, 16, True), (1, 17, False)]
 

@@ -274,6 +274,16 @@ def test_a_foreign_card_is_accepted_by_the_server(tag: bytes) -> None:
         assert client.ask("rs")[91] == 1
 
 
+def test_a_server_that_reads_the_cards_itself_names_the_user() -> None:
+    car = Car()
+    box = EwsBox(cars=(car,))
+    with line_to(box) as (bus, client):
+        assert client.ask("ma", struct.pack(">HH8s", 3, 4, b"BOB")) == OK
+        charging(bus, box, client, car)
+        one = client.ports()[0]
+        assert (one["logged_in"], one["group"], one["card"]) == (1, 3, 4)
+
+
 def test_the_reader() -> None:
     box = EwsBox(rfid=True)
     with line_to(box) as (bus, client):
