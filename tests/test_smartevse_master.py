@@ -191,6 +191,39 @@ async def test_off_is_off_for_one_and_the_other_gets_more(hass: HomeAssistant) -
         assert boxes[1].contactor
 
 
+async def test_without_supply_they_wait_and_are_still_allowed(
+    hass: HomeAssistant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No sun: access is off in the boxes, and nobody has to switch them on again."""
+    slave = sys.modules["custom_components.evse_bus.evse.smartevse.slave"]
+    monkeypatch.setattr(slave, "GIVE_BACK", 1.0)
+    boxes = slaves()
+    async with running(hass, *boxes, supply=SUPPLY) as (entry, bus):
+        await both_charge(hass, entry, boxes)
+        supply = bus_entity(hass, "number", "shared_supply")
+        one, two = [
+            await get_entity(hass, "switch", entry, "charging_allowed", index=index)
+            for index in range(2)
+        ]
+        status = entity_id(hass, "sensor", entry, "1_status")
+        await call(hass, "number.set_value", supply, value=5)
+        await bus.wait_for_async(lambda: not any(box.contactor for box in boxes))
+        await wait_for_state(hass, status, "unavailable")
+        assert not any(box.access for box in boxes)
+        assert (state_of(hass, one), state_of(hass, two)) == ("on", "on")
+        problem = entity_id(hass, "binary_sensor", entry, "problem")
+        assert state_of(hass, problem) == "off"
+        # Off is the user's word, also then.
+        await call(hass, "switch.turn_off", two)
+        assert state_of(hass, two) == "off"
+
+        await call(hass, "number.set_value", supply, value=20)
+        await bus.wait_for_async(lambda: boxes[0].contactor, timeout=10)
+        await wait_for_state(hass, status, "charging")
+        assert not boxes[1].access
+        assert state_of(hass, two) == "off"
+
+
 async def test_the_slaves_stop_without_home_assistant(hass: HomeAssistant) -> None:
     boxes = slaves()
     async with running(hass, *boxes, supply=SUPPLY, time_scale=2) as (entry, bus):

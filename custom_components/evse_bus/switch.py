@@ -111,12 +111,17 @@ class AllowedSwitch(_ChargerSwitch):
 
     @override
     def show(self) -> Hashable:
-        """Show what the charger says; where it cannot, what was ordered."""
-        reading = self.charger.reading
-        told = reading.allowed if reading is not None else None
-        ordered = self.charger.orders.allowed is not False
-        self._attr_is_on = ordered if told is None else told
-        return self._attr_is_on
+        """Show what the charger says; where it cannot, what was ordered.
+
+        What is stopped by ourselves for want of current is allowed: nobody has to
+        switch it on again.
+        """
+        charger = self.charger
+        told = charger.reading.allowed if charger.reading is not None else None
+        if told is None or (told is False and charger.waits_for_current):
+            told = charger.orders.allowed is not False
+        self._attr_is_on = told
+        return told
 
     @override
     async def turn(self, *, on: bool) -> None:

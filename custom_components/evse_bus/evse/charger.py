@@ -109,9 +109,24 @@ class Charger(ABC):
         return self._clamped[1]
 
     @property
+    def waits_for_current(self) -> bool:
+        """Return whether only a want of current has stopped it, by our own doing.
+
+        Its permission stands: the charger says that it may not charge, and gets that
+        taken back as soon as there is current.
+        """
+        return False
+
+    @property
     def told(self) -> tuple[object, ...]:
         """Return all that listeners may care about, to see whether it changed."""
-        return (self.reading, self.available, self.noticed, self.info)
+        return (
+            self.reading,
+            self.available,
+            self.noticed,
+            self.info,
+            self.waits_for_current,
+        )
 
     @property
     def faults(self) -> frozenset[Fault]:

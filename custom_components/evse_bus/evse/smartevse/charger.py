@@ -58,6 +58,11 @@ class PolledSmartEvse(PolledBox):
         self._limit_paused = False
         """Our own 0 A has turned its access off; a higher limit gives it back."""
 
+    @property
+    @override
+    def waits_for_current(self) -> bool:
+        return self._limit_paused
+
     @override
     def forget(self) -> None:
         super().forget()

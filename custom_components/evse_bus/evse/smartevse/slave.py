@@ -152,6 +152,11 @@ class SlaveSmartEvse(SmartEvseBox):
     def setpoint(self) -> Setpoint:
         return self.setpoint_within(self.share)
 
+    @property
+    @override
+    def waits_for_current(self) -> bool:
+        return self._is_ours
+
     # -- What the master asks ------------------------------------------------------
 
     @property
