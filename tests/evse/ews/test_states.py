@@ -145,7 +145,7 @@ def test_a_power_backup_that_gets_no_charge() -> None:
 
 ALLOWED = {
     StartStop.STOP: set(range(256)) - {0xF0, 0xFF},
-    StartStop.REQUEST_START: {0x10, 0x30},
+    StartStop.REQUEST_START: {0x30},
     StartStop.START: {0x30},
     StartStop.OPTIMISE: {0x00, 0x10, 0x30, 0x40, 0x41, 0x42, 0x43, 0x50},
     StartStop.DO_NOT_OPTIMISE: {0x00, 0x10, 0x30, 0x40, 0x41, 0x42, 0x43, 0x50},
@@ -186,4 +186,4 @@ def test_a_pause_never_unlocks() -> None:
 def test_nobody_is_started_who_is_not_there(code: int) -> None:
     for paused in (True, False):
         assert not is_allowed(StartStop.START, code, paused=paused)
-    assert not is_allowed(StartStop.REQUEST_START, 0x00)
+    assert not is_allowed(StartStop.REQUEST_START, code)

@@ -212,9 +212,9 @@ RULES: Final[Mapping[StartStop, Rule]] = {
     StartStop.STOP: Rule(
         frozenset(range(0x100)) - {STARTING, TEST}, "the box is not ready"
     ),
+    # In 0x10 nobody may be there either: a fixed cable always is (see `state_of`).
     StartStop.REQUEST_START: Rule(
-        frozenset({SEARCHING, WAITING}),
-        "without a cable it would start whoever comes next",
+        frozenset({WAITING}), "it would start whoever comes next"
     ),
     StartStop.START: Rule(
         frozenset({WAITING}),
