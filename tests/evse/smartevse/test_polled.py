@@ -9,6 +9,7 @@ from custom_components.evse_bus.evse.errors import (
     EvseError,
     NotConfirmedError,
     RefusedOrderError,
+    SupersededError,
 )
 from custom_components.evse_bus.evse.model import (
     Capability,
@@ -471,6 +472,82 @@ def test_scan(dialect: Dialect) -> None:
         assert report.duplicates == ()
         assert all(
             sent.data[1] in (3, 4) for sent in scene.line.sent if sent.when > since
+        )
+
+    play(PolledScene(dialect), acts)
+
+
+def test_a_start_whose_answer_was_lost_gives_way_to_a_pause() -> None:
+    async def acts(scene: PolledScene) -> None:
+        scene.box.misses = lambda data: data[1] == 0x10
+        start = asyncio.create_task(
+            scene.charger.change_orders(OrderChange(allowed=True))
+        )
+        await scene.until(lambda: 1 in scene.accesses())
+        since = now()
+        # Unheard, too, but the box is read back to be off already.
+        await scene.charger.change_orders(OrderChange(allowed=False))
+        with pytest.raises(SupersededError):
+            await start
+        assert 1 not in scene.accesses(since=since + 0.01)
+
+    play(PolledScene(V2_20, allowed=False), acts)
+
+
+@each
+def test_a_power_failure_between_two_cars(dialect: Dialect) -> None:
+    """The next one finds no override of us in the box, unless it is seen to."""
+
+    async def acts(scene: PolledScene) -> None:
+        await scene.charge()
+        await scene.polled(3)
+        scene.car.leave()
+        await scene.polled(3)
+        scene.box.controller.power_cycle()
+        await scene.polled(2)
+        assert scene.outlet.override == 60
+
+    play(PolledScene(dialect), acts)
+
+
+def test_half_a_2_20_is_no_known_firmware() -> None:
+    """It answers 0xA0 with a number and is silent at 0xA9: nothing is written."""
+
+    async def run() -> PolledScene:
+        scene = PolledScene(V2_20)
+        scene.box.misses = lambda data: data[1] == 3
+        async with scene:
+            await scene.until(
+                lambda: Fault.UNSUPPORTED_FIRMWARE in scene.charger.faults
+            )
+            await asyncio.sleep(60)
+        return scene
+
+    scene = simulate(run())
+    assert scene.writes() == []
+    assert scene.charger.reading is None
+    assert scene.charger.dialect is None
+
+
+@each
+def test_two_boxes_with_one_address(dialect: Dialect) -> None:
+    async def acts(scene: PolledScene) -> None:
+        scene.box.loses = lambda _data: True
+        write = scene.line.write
+
+        def collide(data: bytes, *, reply_may_equal: bool = False) -> float:
+            end = write(data, reply_may_equal=reply_may_equal)
+            asyncio.get_running_loop().call_at(
+                end + 0.01, scene.line.noise, bytes.fromhex("01041200ffffffff0000")
+            )
+            return end
+
+        scene.line.write = collide  # type: ignore[method-assign]
+        await scene.until(lambda: Fault.DUPLICATE_ADDRESS in scene.charger.faults, 90)
+        scene.line.write = write  # type: ignore[method-assign]
+        scene.box.loses = lambda _data: False
+        await scene.until(
+            lambda: Fault.DUPLICATE_ADDRESS not in scene.charger.faults, 90
         )
 
     play(PolledScene(dialect), acts)

@@ -27,7 +27,7 @@ from ..model import (
 )
 from ..turns import Turns
 from .config import smartevse_config
-from .dialects import MAPS, Block, Dialect
+from .dialects import MAPS, PROBE_A0, Block, Dialect
 from .exchanges import read
 from .probing import Probe
 from .readings import capabilities_of, charger_info, charger_reading
@@ -74,6 +74,7 @@ class SmartEvseReader(Charger):
         self._serial: str | None = None
         self._plug_doubted_until = 0.0
         self._not_understood = 0
+        self._half_known = 0
 
     # -- What it is and has --------------------------------------------------------
 
@@ -154,6 +155,7 @@ class SmartEvseReader(Charger):
             if found is None:
                 yield 0.0
         self.tell(Fault.UNSUPPORTED_FIRMWARE, present=False)
+        self._half_known = 0
         self.dialect = found
         self.info = charger_info(found, self._serial)
 
@@ -162,6 +164,12 @@ class SmartEvseReader(Charger):
             data = await self.read(talk, probe.ask)
         except ExchangeRefusedError as error:
             probe.refused(error.code)
+        except ReplyTimeoutError:
+            # It answered a moment ago: to silence here there is more than noise.
+            self._half_known += probe.ask != PROBE_A0
+            if self._half_known >= NOT_UNDERSTOOD:
+                self.tell(Fault.UNSUPPORTED_FIRMWARE, present=True)
+            raise
         else:
             probe.told(data)
 
