@@ -131,6 +131,15 @@ def test_a_port_in_mode_1_does_not_know_all_of_it() -> None:
         decode_ports(wild + PORT_CHARGING, (False, True))
 
 
+def test_a_port_that_is_not_there_is_not_looked_at() -> None:
+    for second in (54 * b"\xff", PORT_IDLE):
+        assert decode_ports(PORT_CHARGING + second, count=1) == (CHARGING,)
+    with pytest.raises(ImplausibleReplyError):
+        decode_ports(PORT_CHARGING + 54 * b"\xff")
+    with pytest.raises(ImplausibleReplyError):
+        decode_ports(PORT_CHARGING, count=1)
+
+
 # -- rd ------------------------------------------------------------------------------
 
 READ = Details(

@@ -9,6 +9,7 @@ from datetime import datetime
 from enum import KEEP, IntEnum, IntFlag
 from typing import Final
 
+from ..errors import ImplausibleReplyError
 from .fields import Bits, Centivolts, Field, Flag, Moment, Number, Text, Untold
 from .structs import Struct, many, optional
 
@@ -195,14 +196,24 @@ PORT_MODE_1: Final = Struct(
 LENGTH_PORTS: Final = 2 * PORT.length
 
 
-def decode_ports(data: bytes, mode_1: Pair[bool] = (False, False)) -> Pair[PortStatus]:
-    """Return what the answer to ``rc`` says of port 1 and port 2.
+def decode_ports(
+    data: bytes, mode_1: Pair[bool] = (False, False), count: int = 2
+) -> tuple[PortStatus, ...]:
+    """Return what the answer to ``rc`` says of port 1 and, if there is one, port 2.
 
-    ``mode_1``: which of them are in mode 1 (`parameters.CableMode`). Raises
-    ImplausibleReplyError.
+    ``mode_1``: which of them are in mode 1, ``count``: how many there are
+    (`parameters.SystemParameters`); what is told of a port that is not there is not
+    looked at. Raises ImplausibleReplyError.
     """
-    first, second = (PORT_MODE_1 if one else PORT for one in mode_1)
-    return first.decode(data[: PORT.length]), second.decode(data[PORT.length :])
+    if len(data) != LENGTH_PORTS:
+        message = f"{PORT.source}: {len(data)} bytes, not {LENGTH_PORTS}"
+        raise ImplausibleReplyError(message)
+    return tuple(
+        (PORT_MODE_1 if mode_1[at] else PORT).decode(
+            data[at * PORT.length :][: PORT.length]
+        )
+        for at in range(count)
+    )
 
 
 # -- rd: more of the two ports -----------------------------------------------------
