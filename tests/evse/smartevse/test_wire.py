@@ -94,6 +94,8 @@ class Witness:
             self.broken.append(f"{amperes} A written")
         # 6 A is what a box is told while nobody may be told more.
         ceiling = max(MINIMUM_CURRENT, min(self.limit, charger.limits.ceiling))
+        if amperes > INSTALLATION:
+            self.broken.append(f"{amperes} A in an installation for {INSTALLATION} A")
         if amperes > ceiling:
             self.broken.append(f"{amperes} A above {ceiling} A")
         outlet = self.scene.outlet
