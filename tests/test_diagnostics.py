@@ -15,9 +15,10 @@ from custom_components.evse_bus.diagnostics import (
     async_get_config_entry_diagnostics,
     async_get_device_diagnostics,
 )
-from custom_components.evse_bus.redaction import without_serial
-from tests.common import call, get_entity, running, wait_for_state
-from tests.virtual import AblBox, EvboxChargePoint
+from custom_components.evse_bus.evse.protocols import PROTOCOLS
+from custom_components.evse_bus.redaction import on_wire, without_serial
+from tests.common import call, get_entity, running, wait_for_state, wait_until
+from tests.virtual import AblBox, EvboxChargePoint, SmartEvse
 
 
 def texts(data: object) -> list[str]:
@@ -79,6 +80,42 @@ async def test_evbox(hass: HomeAssistant) -> None:
         assert data["chargers"][0]["reading"]["connectors"].keys() == {"1", "2"}
 
 
+async def test_smartevse(hass: HomeAssistant) -> None:
+    box = SmartEvse("later", serial=0x7A69)
+    async with running(hass, box) as (entry, _):
+        await get_entity(hass, "sensor", entry, "1_status")
+        await wait_until(hass, lambda: entry.subentries["smartevse1"].data["serial"])
+        data = await diagnostics(hass, entry)
+        charger = data["chargers"][0]
+        assert charger["config"]["address"] == 1
+        assert charger["info"]["firmware"] == "later than 2.20"
+        assert charger["reading"]["details"]["dialect"] == "later"
+        assert charger["config"]["serial"] == "**REDACTED**"
+        assert data["master"] is None
+        frames = [frame["hex"] for frame in data["frames"]]
+        # The status block is there, but for the number and for what it adds up to.
+        assert any(frame.endswith(b"****".hex()) for frame in frames)
+        assert str(0x7A69) not in "\n".join(texts(data))
+        assert not any("7a69" in frame for frame in frames)
+
+
+async def test_a_bus_with_a_master(hass: HomeAssistant) -> None:
+    box = SmartEvse(load_balance=2)
+    async with running(hass, box, supply={"supply_limit": 14.0}) as (entry, bus):
+        await get_entity(hass, "sensor", entry, "1_status")
+        await bus.wait_for_async(lambda: box.broadcasts)
+        data = await diagnostics(hass, entry)
+        assert data["set_up"]["supply_limit"] == 14.0
+        master = data["master"]
+        assert master["supply"] == {"limit": 14.0, "minimum": 6.0}
+        assert master["order"] == {"limit": None}
+        assert master["shares"] == {"2": 6.0}
+        assert master["silent"] is False
+        assert master["noticed"] == []
+        assert master["statistics"]["missed_deadlines"] >= 0
+        assert data["chargers"][0]["reading"]["details"]["load_balancing"] == 2
+
+
 async def test_a_charger_that_never_answered(hass: HomeAssistant) -> None:
     """No reading, no minimum of anything: JSON has no infinity."""
     box = AblBox(1)
@@ -118,6 +155,19 @@ async def test_of_one_device(hass: HomeAssistant) -> None:
         ("evbox", b"\x0280A06801", b"\x0280A068**"),
         ("abl", b">010310503257", b">01031050****"),
         ("abl", b">01030A2EA1106403E803E803E8EE", b">01030A2EA1106403E803E803E8EE"),
+        # Twelve registers, the last one is it; the checksum would tell, too.
+        (
+            "smartevse",
+            b"\1\4\x18" + b"\0" * 22 + b"ziCC",
+            b"\1\4\x18" + b"\0" * 22 + b"****",
+        ),
+        ("smartevse", b"\1\4\x18" + b"\n" * 22 + b"z", b"\1\4\x18" + b"\n" * 22 + b"*"),
+        (
+            "smartevse",
+            b"\0\4\x12" + b"\0" * 18 + b"CC",
+            b"\0\4\x12" + b"\0" * 18 + b"CC",
+        ),
+        ("smartevse_master", b"\0\x10\0\1zi", b"\0\x10\0\1zi"),
     ],
 )
 def test_serial_numbers_in_frames(protocol: str, data: bytes, shown: bytes) -> None:
@@ -134,11 +184,22 @@ def test_serial_numbers_in_frames(protocol: str, data: bytes, shown: bytes) -> N
         # Another command was made of 68 on the way.
         ("evbox", b"\x02A0804801923054", b"\x02A08048********"),
         ("abl", b">0103105132573232AE", b">01031051********AE"),
+        ("smartevse", b"\0\0ziCC", b"\0\0**CC"),
     ],
 )
 def test_serial_numbers_in_pieces(protocol: str, data: bytes, shown: bytes) -> None:
-    serials = {"evbox": b"01923054", "abl": b"32573232"}
+    serials = {"evbox": b"01923054", "abl": b"32573232", "smartevse": b"zi"}
     assert without_serial(protocol, data, [serials[protocol]], whole=False) == shown
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_serial_numbers_that_are_none(protocol: str) -> None:
+    assert on_wire(protocol, [None, ""]) == []
+
+
+@pytest.mark.parametrize("serial", ["0", "65536", "x", "-1", "1.5"])
+def test_what_is_no_register_is_no_serial_number(serial: str) -> None:
+    assert on_wire("smartevse", [serial, "31337"]) == [b"zi"]
 
 
 @pytest.mark.parametrize("protocol", ["abl", "evbox"])

@@ -13,6 +13,7 @@ from homeassistant.helpers.device_registry import ChildDeviceEntry, DeviceEntry
 
 from .const import CONF_SERIAL, DOMAIN
 from .coordinator import BusCoordinator, EvseBusConfigEntry
+from .evse.smartevse import Master
 from .evse.statistics import Direction
 from .redaction import on_wire, without_serial
 from .unit import ChargerUnit
@@ -42,6 +43,7 @@ async def async_get_config_entry_diagnostics(
             "utilisation": bus.wire.statistics.utilisation(hass.loop.time()),
             **plain(bus.wire.statistics),
         },
+        "master": _master(coordinator),
         "chargers": [
             _charger(coordinator, unit) for unit in coordinator.units.values()
         ],
@@ -64,6 +66,25 @@ async def async_get_device_diagnostics(
                 "frames": _frames(coordinator),
             }
     return await async_get_config_entry_diagnostics(hass, entry)
+
+
+def _master(coordinator: BusCoordinator) -> dict[str, Any] | None:
+    """Return what the master of a bus does; ``None``: the bus has none."""
+    duty = coordinator.bus.duty
+    if duty is None:
+        return None
+    order = coordinator.orders.supply
+    data = {
+        "silent": duty.silent,
+        "noticed": plain(duty.noticed),
+        "order": plain(order),
+        "statistics": plain(duty.statistics),
+    }
+    if isinstance(duty, Master):
+        shares = duty.shares()
+        data["supply"] = plain(duty.supply)
+        data["shares"] = {str(unit): share / 10 for unit, share in shares.items()}
+    return data
 
 
 def _charger(coordinator: BusCoordinator, unit: ChargerUnit) -> dict[str, Any]:
