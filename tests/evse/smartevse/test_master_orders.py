@@ -6,7 +6,7 @@ import pytest
 
 from custom_components.evse_bus.evse.errors import NotConfirmedError
 from custom_components.evse_bus.evse.model import Fault, OrderChange, Setting, Supply
-from custom_components.evse_bus.evse.smartevse.slave import GIVE_BACK
+from custom_components.evse_bus.evse.smartevse.member import GIVE_BACK
 from tests.evse.simulated import now, simulate
 from tests.evse.smartevse.ether import MasterScene
 

@@ -15,6 +15,7 @@ from ..jobs import Later
 from .balancing import RequestKind, SlaveRequest
 
 if TYPE_CHECKING:
+    from .member import Member
     from .slave import SlaveSmartEvse
 
 ANSWER_WITHIN: Final = 0.8
@@ -35,7 +36,7 @@ class Answer:
         self._request = request
         self._too_late = heard_at + ANSWER_WITHIN
         self._rounds = ROUNDS
-        self._others: list[SlaveSmartEvse] = []
+        self._others: list[Member] = []
 
     async def give(self, talk: Talk) -> Later[None] | None:
         """Answer, or let the others make room first."""

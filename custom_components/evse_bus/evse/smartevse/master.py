@@ -15,18 +15,18 @@ from math import inf
 from typing import TYPE_CHECKING, Final, cast, override
 
 from ..duty import Duty
-from ..errors import LineBusyError, NotAvailableError, RefusedOrderError
+from ..errors import LineBusyError, NotAvailableError
 from ..exchange import Request, Talk
 from ..framing import Frame
 from ..modbus import ModbusFrame
-from ..model import MAXIMUM_CURRENT, MINIMUM_CURRENT, Fault, Supply
-from ..safety import number, round_down
+from ..model import Fault, Supply
 from .balancing import CURRENTS, broadcast, decode_request, is_foreign_broadcast
 from .registers import LONGEST_REQUEST, tenths
 from .sharing import (
     STOPS_ALONE,
     Claim,
     Draw,
+    checked,
     grant,
     in_the_way,
     next_values,
@@ -34,7 +34,7 @@ from .sharing import (
 )
 
 if TYPE_CHECKING:
-    from .slave import SlaveSmartEvse
+    from .member import Member
 
 _LOGGER: Final = logging.getLogger(__name__)
 
@@ -57,7 +57,6 @@ RETRY: Final = 0.5
 PATIENCE: Final = 3.0
 """Longest wait for a broadcast that carries a new supply, s."""
 
-_SHARE_STEP: Final = 0.1
 _OTHER_MASTER: Final = (
     "another master speaks on this line; two masters would undo each other's limits"
 )
@@ -78,7 +77,7 @@ class Master(Duty):
     def __init__(self, supply: Supply) -> None:
         """Raise RefusedOrderError for a supply that cannot be."""
         super().__init__()
-        self._supply = _checked(supply)
+        self._supply = checked(supply)
         self._phase = _Phase.LISTENING
         self._planned = 0.0
         self._unknown_until = inf
@@ -101,7 +100,7 @@ class Master(Duty):
 
         Raises RefusedOrderError for a supply that cannot be.
         """
-        self._supply = _checked(supply)
+        self._supply = checked(supply)
         self.updated()
         self._has_spoken.clear()
         self.changed()
@@ -123,15 +122,19 @@ class Master(Duty):
     # -- The slaves --------------------------------------------------------------
 
     @property
-    def slaves(self) -> list[SlaveSmartEvse]:
+    def slaves(self) -> list[Member]:
         """Return the slaves that are set up; nothing else is on this bus."""
         if self.bus is None:
             return []
-        return cast("list[SlaveSmartEvse]", list(self.bus.chargers.values()))
+        return cast("list[Member]", list(self.bus.chargers.values()))
 
     def draw(self, unit: int) -> Draw:
         """Return what is known of the current of one unit."""
-        return self._draws.setdefault(unit, Draw(self._unknown_until))
+        if unit not in self._draws:
+            draw = self._draws[unit] = Draw(self._unknown_until)
+            # It was nobody's word so far, and heard so.
+            draw.said(0, self._last[0])
+        return self._draws[unit]
 
     def _all_draws(self) -> dict[int, Draw]:
         """Return the draws of all that may follow our broadcasts.
@@ -172,7 +175,7 @@ class Master(Duty):
     def _values(self, now: float) -> dict[int, int]:
         return next_values(self._limit, self.shares(), self._all_draws(), now)
 
-    def in_the_way(self, unit: int) -> list[SlaveSmartEvse]:
+    def in_the_way(self, unit: int) -> list[Member]:
         """Return the slaves that must go down first before this one may begin."""
         found = in_the_way(self.shares(), self._all_draws(), self.now)
         units = set(found) - {unit}
@@ -185,14 +188,14 @@ class Master(Duty):
 
     # -- What the slaves tell ----------------------------------------------------
 
-    def took(self, slave: SlaveSmartEvse, value: int, *, closed: bool) -> None:
+    def took(self, slave: Member, value: int, *, closed: bool) -> None:
         """Note what a slave read back (0.1 A), and whether its contactor is closed."""
         self.draw(slave.unit).read(value, self.now, closed=closed)
         if slave.configuration is not None:
             self._looked(slave.unit)
         self.changed()
 
-    def missed(self, slave: SlaveSmartEvse) -> None:
+    def missed(self, slave: Member) -> None:
         """Note that a slave did not answer."""
         self._looked(slave.unit)
         self.changed()
@@ -383,15 +386,3 @@ class Master(Duty):
         if fresh and self.bus is not None:
             _LOGGER.warning("%s: %s", self.bus.name, _OTHER_MASTER)
             self.bus.hush(_OTHER_MASTER)
-
-
-def _checked(supply: Supply) -> Supply:
-    """Return a supply as it can be shared, on the step of the wire."""
-    limit = number(supply.limit, "limit of the supply")
-    minimum = number(supply.minimum, "minimum of a charger")
-    if not MINIMUM_CURRENT <= minimum <= MAXIMUM_CURRENT:
-        message = f"{minimum:g} A is no minimum of a charger ({MINIMUM_CURRENT:g} A)"
-        raise RefusedOrderError(message)
-    return Supply(
-        limit=round_down(limit, _SHARE_STEP), minimum=round_down(minimum, _SHARE_STEP)
-    )

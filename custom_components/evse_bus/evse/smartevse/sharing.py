@@ -24,12 +24,33 @@ from dataclasses import dataclass
 from math import inf
 from typing import Final
 
+from ..errors import RefusedOrderError
+from ..model import MAXIMUM_CURRENT, MINIMUM_CURRENT, Supply
+from ..safety import number, round_down
+
 LOWEST: Final = 60
 """0.1 A; a box that charges offers no less, whatever it hears."""
 HIGHEST: Final = 800
 """0.1 A; a box takes more for nonsense, and offers the lowest."""
 STOPS_ALONE: Final = 12.0
 """Time without a broadcast after which a box has stopped by itself, s (10 to 11)."""
+
+
+_STEP: Final = 0.1
+"""A, of the wire."""
+
+
+def checked(supply: Supply) -> Supply:
+    """Return a supply on the step of the wire.
+
+    Raises RefusedOrderError for one that cannot be shared.
+    """
+    limit = number(supply.limit, "limit of the supply")
+    minimum = number(supply.minimum, "minimum of a charger")
+    if not MINIMUM_CURRENT <= minimum <= MAXIMUM_CURRENT:
+        message = f"{minimum:g} A is no minimum of a charger ({MINIMUM_CURRENT:g} A)"
+        raise RefusedOrderError(message)
+    return Supply(limit=round_down(limit, _STEP), minimum=round_down(minimum, _STEP))
 
 
 def offered(value: int) -> int:

@@ -1,0 +1,184 @@
+"""Our master and virtual slaves on a real pty: the supply, and our silence."""
+
+import asyncio
+from itertools import pairwise
+from typing import ClassVar, Literal, override
+
+from custom_components.evse_bus.evse.bus import Bus
+from custom_components.evse_bus.evse.model import (
+    CurrentLimit,
+    OrderChange,
+    Orders,
+    ScanReport,
+    Supply,
+)
+from custom_components.evse_bus.evse.smartevse import MASTER, SlaveConfig
+from tests.virtual import Car, SmartEvse, VirtualBus, smartevse_requests_in
+from tests.virtual.device import Device
+
+PATIENCE = 20.0
+
+
+class Witness(Device):
+    """Sees at each step what all boxes offer with closed contactors."""
+
+    baud: ClassVar[int] = 9600
+    parity: ClassVar[str] = "N"
+    protocol: ClassVar[str] = "smartevse"
+
+    def __init__(self, *boxes: SmartEvse) -> None:
+        super().__init__("witness")
+        self.boxes = boxes
+        self.most = 0.0
+        self.opened_at: float | None = None
+
+    @override
+    def step(self) -> None:
+        offers = [box.pilot_current for box in self.boxes if box.contactor]
+        self.most = max(self.most, sum(offers))
+        if offers:
+            self.opened_at = None
+        elif self.opened_at is None:
+            self.opened_at = self.now()
+
+    @override
+    def hear(self, segment: object) -> None:
+        pass
+
+
+def make_box(unit: Literal[2, 3, 4]) -> SmartEvse:
+    return SmartEvse("2.17", load_balance=unit, cable=32, max_current=32, car=Car())
+
+
+def config(unit: int) -> SlaveConfig:
+    return SlaveConfig(
+        key=str(unit), name=f"slave {unit}", address=unit, installation_limit=16.0
+    )
+
+
+def put_on(bus: Bus, *units: int) -> None:
+    for unit in units:
+        orders = Orders(limit=CurrentLimit(current=16.0), allowed=True)
+        bus.add(MASTER.charger(config(unit), orders))
+
+
+def car_of(box: SmartEvse) -> Car:
+    assert box.car is not None
+    return box.car
+
+
+async def test_two_cars_share_16_a() -> None:
+    """One after the other, up and down; the contactors and pilots are the witness."""
+    boxes = make_box(2), make_box(3)
+    witness = Witness(*boxes)
+    async with VirtualBus.pty(*boxes, witness) as virtual:
+        bus = MASTER.bus(virtual.url, supply=Supply(limit=16.0))
+        put_on(bus, 2, 3)
+        async with bus:
+            for charger in bus.chargers.values():
+                await charger.wait_available()
+            car_of(boxes[0]).plug_in()
+            await virtual.wait_for_async(
+                lambda: boxes[0].contactor and boxes[0].pilot_current == 16,
+                timeout=PATIENCE,
+            )
+            car_of(boxes[1]).plug_in()
+            await virtual.wait_for_async(
+                lambda: (
+                    [box.pilot_current for box in boxes] == [8, 8]
+                    and boxes[1].contactor
+                ),
+                timeout=PATIENCE,
+            )
+            await bus.chargers["2"].change_orders(OrderChange(current=6.0))
+            await virtual.wait_for_async(
+                lambda: [box.pilot_current for box in boxes] == [6, 10],
+                timeout=PATIENCE,
+            )
+            await bus.chargers["3"].change_orders(OrderChange(allowed=False))
+            assert not boxes[1].contactor
+            await bus.chargers["2"].change_orders(OrderChange(current=16.0))
+            await virtual.wait_for_async(
+                lambda: boxes[0].pilot_current == 16, timeout=PATIENCE
+            )
+        assert witness.most == 16
+        assert max(box.controller.dropped for box in boxes) == 0
+        beats = [r.t for r in smartevse_requests_in(virtual) if r.unit == 0]
+        assert max(b - a for a, b in pairwise(beats)) < 2.2
+
+
+async def test_killed_without_a_goodbye_the_slaves_stop_by_themselves() -> None:
+    box = make_box(2)
+    witness = Witness(box)
+    async with VirtualBus.pty(box, witness) as virtual:
+        bus = MASTER.bus(virtual.url, supply=Supply(limit=16.0))
+        put_on(bus, 2)
+        await bus.start()
+        await bus.chargers["2"].wait_available()
+        car_of(box).plug_in()
+        await virtual.wait_for_async(lambda: box.contactor, timeout=PATIENCE)
+        # Nobody waits for anything, nothing is closed: the task is just gone.
+        task = bus._task
+        assert task is not None
+        task.cancel()
+        await asyncio.wait({task})
+        last = box.broadcasts[-1].t
+        virtual.time_scale = 20
+        await virtual.wait_for_async(lambda: not box.contactor, timeout=PATIENCE)
+        assert witness.opened_at is not None
+        assert 9 <= witness.opened_at - last <= 11.5
+        assert box.error & 2
+        virtual.time_scale = 1
+        await bus.stop()
+
+
+async def test_stopped_and_started_again_who_charges_goes_on() -> None:
+    box = make_box(2)
+    witness = Witness(box)
+    async with VirtualBus.pty(box, witness) as virtual:
+        bus = MASTER.bus(virtual.url, supply=Supply(limit=16.0))
+        put_on(bus, 2)
+        async with bus:
+            await bus.chargers["2"].wait_available()
+            car_of(box).plug_in()
+            await virtual.wait_for_async(
+                lambda: box.contactor and box.pilot_current == 16, timeout=PATIENCE
+            )
+        heard = len(box.broadcasts)
+        bus = MASTER.bus(virtual.url, supply=Supply(limit=16.0))
+        put_on(bus, 2)
+        async with bus:
+            await virtual.wait_for_async(
+                lambda: len(box.broadcasts) >= heard + 2, timeout=PATIENCE
+            )
+            assert {sent.currents[1] for sent in box.broadcasts[heard:]} == {160}
+            assert box.contactor
+            assert witness.opened_at is None
+            assert len(box.requests_sent) == 2
+
+
+async def test_the_scan_finds_slaves_and_says_nothing_else() -> None:
+    boxes = make_box(2), make_box(4)
+    async with (
+        VirtualBus.pty(*boxes) as virtual,
+        MASTER.bus(virtual.url, supply=Supply()) as bus,
+    ):
+        report: ScanReport = await MASTER.scan(
+            bus, config(2), Orders(limit=CurrentLimit(current=6.0)), lambda _share: None
+        )
+        assert [found.address for found in report.found] == [2, 4]
+        assert not boxes[0].writes
+        assert not boxes[0].broadcasts
+
+
+async def test_a_box_that_is_master_itself_silences_us() -> None:
+    boxes = SmartEvse("2.17", load_balance=1), make_box(2)
+    async with VirtualBus.pty(*boxes) as virtual:
+        bus = MASTER.bus(virtual.url, supply=Supply(limit=16.0))
+        put_on(bus, 2)
+        async with bus:
+            assert bus.duty is not None
+            duty = bus.duty
+            await virtual.wait_for_async(lambda: duty.noticed, timeout=PATIENCE)
+            await asyncio.sleep(1.5)
+            assert smartevse_requests_in(virtual) == []
