@@ -1,6 +1,7 @@
 """Sharing a supply: splits, and what boxes may be offering; pure."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from hypothesis import given, settings, strategies as st
 import pytest
@@ -221,10 +222,31 @@ class World:
         if arrives:
             slave.granted(value)
 
-    def passes(self, seconds: float) -> None:
+    def wait(self, seconds: float) -> None:
         self.now += seconds
         for slave in self.slaves.values():
             slave.passes(seconds)
+
+    def does(self, what: str, *rest: Any) -> None:  # noqa: ANN401 - a step
+        unit = rest[0]
+        match what:
+            case "ask":
+                self.ask(unit, arrives=rest[1])
+            case "end":
+                self.slaves[unit].closed = False
+            case "b":
+                self.slaves[unit].in_b = not self.slaves[unit].in_b
+            case "wish":
+                self.wishes[unit] = rest[1]
+            case "gone":
+                self.gone.add(unit)
+            case "back":
+                self.gone.discard(unit)
+            case "reset":
+                self.slaves[unit] = Slave()
+            case _:
+                # Read, broadcast, wait.
+                getattr(self, what)(*rest)
 
     @property
     def offers(self) -> int:
@@ -263,27 +285,7 @@ def test_boxes_never_offer_more_than_the_limit(
     }
     world = World(limit, minimum, slaves, dict.fromkeys(slaves, 320))
     for what, *rest in story:
-        match what, *rest:
-            case "broadcast", hearing:
-                world.broadcast(hearing)
-            case "read", unit:
-                world.read(unit)
-            case "ask", unit, arrives:
-                world.ask(unit, arrives=arrives)
-            case "end", unit:
-                slaves[unit].closed = False
-            case "b", unit:
-                slaves[unit].in_b = not slaves[unit].in_b
-            case "wish", unit, wish:
-                world.wishes[unit] = wish
-            case "gone", unit:
-                world.gone.add(unit)
-            case "back", unit:
-                world.gone.discard(unit)
-            case "reset", unit:
-                slaves[unit] = world.slaves[unit] = Slave()
-            case "wait", seconds:
-                world.passes(seconds)
+        world.does(what, *rest)
         assert world.offers <= limit
 
 
