@@ -1,4 +1,4 @@
-"""All entities of both protocols as Home Assistant shows them, as snapshots."""
+"""All entities of every protocol as Home Assistant shows them, as snapshots."""
 
 from homeassistant.const import Platform
 from homeassistant.core import HomeAssistant
@@ -7,34 +7,45 @@ import pytest
 from syrupy.assertion import SnapshotAssertion
 
 from custom_components.evse_bus.const import DOMAIN
+from custom_components.evse_bus.evse.protocols import PROTOCOLS
 from custom_components.evse_bus.sensor_tables import BUS_SENSORS, CHARGER_STATISTICS
 from tests.common import call, get_entity, running, wait_for_state, wait_until
-from tests.virtual import AblBox, EvboxChargePoint
+from tests.virtual import AblBox, EvboxChargePoint, SmartEvse
 from tests.virtual.device import Device
 
 # What depends on when one looks, or on what flowed meanwhile.
-UNSTEADY = ("round_trip", "utilisation", "requests", "timeouts", "reasserted")
+UNSTEADY = (
+    *("round_trip", "utilisation", "requests", "timeouts", "reasserted"),
+    "missed_deadlines",
+)
+SUPPLY = {"smartevse_master": {"supply_limit": 20.0}}
 
 
-def boxes(protocol: str) -> tuple[Device, str]:
-    """Return a virtual charger, and the entity that is there last."""
+def boxes(protocol: str) -> tuple[Device, str, str]:
+    """Return a virtual charger, and platform and key of what is there last."""
     if protocol == "abl":
-        return AblBox(1), "1_estimated_energy"
-    return EvboxChargePoint(1923054, 2, min_interval=0), "2_energy"
+        return AblBox(1), "sensor", "1_estimated_energy"
+    if protocol == "evbox":
+        return EvboxChargePoint(1923054, 2, min_interval=0), "sensor", "2_energy"
+    if protocol == "smartevse":
+        # Everything that a SmartEVSE can have.
+        box = SmartEvse("later", mode=1)
+        return box, "select", "setting_mode_at_start"
+    return SmartEvse(load_balance=2), "number", "setting_maximum_current"
 
 
 @pytest.mark.usefixtures("all_entities_enabled")
-@pytest.mark.parametrize("protocol", ["abl", "evbox"])
+@pytest.mark.parametrize("protocol", PROTOCOLS)
 async def test_entities(
     hass: HomeAssistant, snapshot: SnapshotAssertion, protocol: str
 ) -> None:
-    device, last = boxes(protocol)
-    async with running(hass, device, poll_interval=0.5, order_lifetime=60) as (
-        entry,
-        _,
-    ):
-        energy = await get_entity(hass, "sensor", entry, last)
-        await wait_for_state(hass, energy, lambda state: float(state.state) >= 0)
+    device, platform, last = boxes(protocol)
+    supply = SUPPLY.get(protocol)
+    async with running(
+        hass, device, supply=supply, poll_interval=0.5, order_lifetime=60
+    ) as (entry, _):
+        entity = await get_entity(hass, platform, entry, last)
+        await wait_for_state(hass, entity, lambda state: state.state)
         if protocol == "abl":
             # Read back above the order, it is brought down right away.
             offered = await get_entity(hass, "sensor", entry, "offered_current")
@@ -50,13 +61,14 @@ async def test_entities(
                 assert state == snapshot(name=f"{one.entity_id}-state")
 
 
-@pytest.mark.parametrize("protocol", ["abl", "evbox"])
+@pytest.mark.usefixtures("all_entities_enabled")
+@pytest.mark.parametrize("protocol", PROTOCOLS)
 async def test_devices(
     hass: HomeAssistant, snapshot: SnapshotAssertion, protocol: str
 ) -> None:
-    device, last = boxes(protocol)
+    device, platform, last = boxes(protocol)
     async with running(hass, device, poll_interval=0.5) as (entry, _):
-        await get_entity(hass, "sensor", entry, last)
+        await get_entity(hass, platform, entry, last)
         registry = dr.async_get(hass)
         charger = next(iter(entry.subentries))
         find = registry.async_get_device_by_identifier
