@@ -175,8 +175,8 @@ def command(box: EwsBox, word: str, port: int, values: list[str]) -> bool:
         seconds = float(values[1]) if len(values) > 1 else 0.3
         box.press_key(port, int(values[0]), seconds)
     elif word == "card":
-        numbers = [int(value) for value in values[:2]]
-        box.present_card(Card(*numbers))
+        group, number = [*(int(value) for value in values), 1, 1][:2]
+        box.present_card(Card(group, number))
     elif word == "remove-card":
         box.remove_card()
     elif word in ("web-start", "web-stop"):
