@@ -90,6 +90,29 @@ def test_a_box_that_does_not_follow_is_told_of() -> None:
     simulate(scene())
 
 
+def test_a_box_that_stays_above_its_share_is_told_of() -> None:
+    """Without any command: its share fell, and it does not hear so."""
+
+    async def scene() -> None:
+        async with MasterScene(limit=32.0, watch=False) as scene:
+            await asyncio.sleep(5)
+            await scene.charge(2)
+            await asyncio.sleep(3)
+            scene.box(2).misses = lambda data: data.startswith(b"\x00\x10")
+            begin = now()
+            await scene.master.change_supply(Supply(limit=10.0))
+            await asyncio.sleep(5)
+            assert Fault.LIMIT_NOT_TAKEN in scene.slave(2).faults
+            # Said again with each reading that shows it, beside the regular ones.
+            assert len(scene.broadcasts(begin)) >= 5
+            scene.box(2).misses = lambda _data: False
+            await asyncio.sleep(3)
+            assert scene.offers == 10
+            assert Fault.LIMIT_NOT_TAKEN not in scene.slave(2).faults
+
+    simulate(scene())
+
+
 def test_off_is_the_access_bit_and_not_a_broadcast_of_0() -> None:
     async def scene() -> None:
         async with MasterScene(units=(2,)) as scene:

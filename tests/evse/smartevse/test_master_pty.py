@@ -4,6 +4,8 @@ import asyncio
 from itertools import pairwise
 from typing import ClassVar, Literal, override
 
+import pytest
+
 from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.model import (
     CurrentLimit,
@@ -12,7 +14,7 @@ from custom_components.evse_bus.evse.model import (
     ScanReport,
     Supply,
 )
-from custom_components.evse_bus.evse.smartevse import MASTER, SlaveConfig
+from custom_components.evse_bus.evse.smartevse import MASTER, SlaveConfig, master
 from tests.virtual import Car, SmartEvse, VirtualBus, smartevse_requests_in
 from tests.virtual.device import Device
 
@@ -67,6 +69,13 @@ def car_of(box: SmartEvse) -> Car:
     return box.car
 
 
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """There is no other master here: no need to listen for it for so long."""
+    monkeypatch.setattr(master, "LISTENING", 0.3)
+
+
+@pytest.mark.usefixtures("impatient")
 async def test_two_cars_share_16_a() -> None:
     """One after the other, up and down; the contactors and pilots are the witness."""
     boxes = make_box(2), make_box(3)
@@ -107,6 +116,7 @@ async def test_two_cars_share_16_a() -> None:
         assert max(b - a for a, b in pairwise(beats)) < 2.2
 
 
+@pytest.mark.usefixtures("impatient")
 async def test_killed_without_a_goodbye_the_slaves_stop_by_themselves() -> None:
     box = make_box(2)
     witness = Witness(box)
@@ -132,6 +142,7 @@ async def test_killed_without_a_goodbye_the_slaves_stop_by_themselves() -> None:
         await bus.stop()
 
 
+@pytest.mark.usefixtures("impatient")
 async def test_stopped_and_started_again_who_charges_goes_on() -> None:
     box = make_box(2)
     witness = Witness(box)
@@ -157,6 +168,7 @@ async def test_stopped_and_started_again_who_charges_goes_on() -> None:
             assert len(box.requests_sent) == 2
 
 
+@pytest.mark.usefixtures("impatient")
 async def test_the_scan_finds_slaves_and_says_nothing_else() -> None:
     boxes = make_box(2), make_box(4)
     async with (
