@@ -28,6 +28,7 @@ LITERALS = (
     # What is the same in every language because a machine or a label says it.
     *("8N1", "8E1", "F4", "RS-485", "D+", "D-", "/dev/serial/by-id", "dialout"),
     *("A-F", "L1", "L2", "L3", "EVBox", "ABL", "eMH1", "EVCC2/3", "Protocol Max v4"),
+    *("SmartEVSE", "LOAD BAL", "Disabled", "MODE", "MAX", "Slave 1", "Slave 2"),
     "Home Assistant",
 )
 MARKDOWN = ("**", "\n\n", "\n- ", "|", "|---", "`", "#", "<", "](")
@@ -38,12 +39,17 @@ SAME_EVERYWHERE = {
     *("L2, L3, L1", "L3, L1, L2", "L3, L2, L1"),
     # Numbers of stop bits.
     *("1", "2"),
+    # Words of a SmartEVSE's menu.
+    *("Normal", "Smart", "Solar"),
 }
 SAME = {
     # The language has the same word.
-    "de": {"Name", "Port", "Status"},
+    "de": {"Name", "Port", "Slave", "Slaves", "Status"},
     "fr": {"Message", "Module {number}", "Port"},
-    "nl": {"Even", "Module {number}", "Protocol", "Status", "Time-outs"},
+    "nl": {
+        *("Even", "Module {number}", "Protocol", "Slave", "Slaves", "Status"),
+        "Time-outs",
+    },
 }
 
 MISSING_NO_BREAK_SPACE = re.compile(
