@@ -113,6 +113,27 @@ async def test_somebody_turns_access_off_at_the_box(hass: HomeAssistant) -> None
         assert not box.access
 
 
+async def test_a_limit_of_nothing_leaves_it_allowed(hass: HomeAssistant) -> None:
+    """A box has no other stop than its access: what a limit took, a limit gives."""
+    box = SmartEvse(car=car())
+    async with running(hass, box, fail_safe_current=0.0) as (entry, bus):
+        box.car.plug_in()
+        await bus.wait_for_async(lambda: box.writes and not box.access)
+        allowed = await get_entity(hass, "switch", entry, "charging_allowed")
+        limit = await get_entity(hass, "number", entry, "charging_current")
+        await wait_for_state(hass, allowed, "on")
+        assert state_of(hass, limit) == "0.0"
+        await call(hass, "number.set_value", limit, value=8)
+        assert box.access
+        assert state_of(hass, allowed) == "on"
+
+        # What the user has switched off no limit switches on.
+        await call(hass, "switch.turn_off", allowed)
+        await call(hass, "number.set_value", limit, value=10)
+        assert not box.access
+        assert state_of(hass, allowed) == "off"
+
+
 async def test_to_wait_for_current_is_no_problem(hass: HomeAssistant) -> None:
     box = SmartEvse(car=car(), mode=1)
     box.outlet.meter_leaves = 0.0

@@ -1,6 +1,5 @@
 """Home Assistant as the master of SmartEVSE slaves: one supply, one master."""
 
-import sys
 from typing import Any
 
 from homeassistant.const import EVENT_HOMEASSISTANT_STOP
@@ -22,7 +21,7 @@ from tests.common import (
     wait_for_state,
     wait_until,
 )
-from tests.smartevse import car
+from tests.smartevse import car, shorten
 from tests.test_coordinator import issue
 from tests.virtual import SmartEvse, VirtualBus, smartevse_requests_in
 
@@ -33,9 +32,7 @@ SUPPLY = {"supply_limit": 20.0, "supply_minimum": 6.0}
 @pytest.fixture(autouse=True)
 def quick_master(monkeypatch: pytest.MonkeyPatch) -> None:
     """Listen for less long before we speak; the others' time runs faster."""
-    master = sys.modules["custom_components.evse_bus.evse.smartevse.master"]
-    monkeypatch.setattr(master, "LISTENING", 0.6)
-    monkeypatch.setattr(master, "OTHERS", 1.0)
+    shorten(monkeypatch, LISTENING=0.6, OTHERS=1.0)
 
 
 def slaves(count: int = 2, **options: Any) -> list[SmartEvse]:  # noqa: ANN401 - a box's
@@ -195,8 +192,7 @@ async def test_without_supply_they_wait_and_are_still_allowed(
     hass: HomeAssistant, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No sun: access is off in the boxes, and nobody has to switch them on again."""
-    slave = sys.modules["custom_components.evse_bus.evse.smartevse.slave"]
-    monkeypatch.setattr(slave, "GIVE_BACK", 1.0)
+    shorten(monkeypatch, GIVE_BACK=1.0)
     boxes = slaves()
     async with running(hass, *boxes, supply=SUPPLY) as (entry, bus):
         await both_charge(hass, entry, boxes)

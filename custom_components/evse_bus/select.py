@@ -82,10 +82,7 @@ class ModeAtStartSelect(SettingEntity, SelectEntity):
     def show(self) -> Hashable:
         """Show what the box told."""
         told = self.told
-        if told is None or told not in range(len(MODES)):
-            self._attr_current_option = None
-        else:
-            self._attr_current_option = MODES[told]
+        self._attr_current_option = None if told is None else MODES[told]
         return told
 
     @override
