@@ -8,6 +8,7 @@ from statistics import fmean
 from typing import Final
 
 from custom_components.evse_bus.evse.bus import Bus
+from custom_components.evse_bus.evse.model import OrderChange, Supply
 from custom_components.evse_bus.evse.smartevse.master import SLACK
 
 from .balancing import (
@@ -23,7 +24,16 @@ from .commands import House
 from .figures import Figure, gaps, percentile
 from .offers import Offer
 from .progress import say
-from .set_points import set_point_figures, set_points, until_all_charge
+from .set_points import (
+    HIGH,
+    LOW,
+    PAUSES,
+    Called,
+    offered_after,
+    set_point_figures,
+    set_points,
+    until_all_charge,
+)
 from .setup import master_bus, settled
 from .witness import Witness
 
@@ -34,7 +44,7 @@ at 9600 8N1, each polled every 2 s; library alone. Their cars come, wait, charge
 leave by themselves; meanwhile currents (6 to 16 A), permissions and the shared supply
 (12 to 32 A) change at random moments, 1 s apart on average. Then the same with one of
 them dead, and then, with both cars charging all the time and 32 A to share, set-points
-alone. All times are from the virtual bus's log and from the boxes' own diaries.
+alone; at last 22 A to share, where one goes up only after the other has gone down. All times are from the virtual bus's log and from the boxes' own diaries.
 Deviation: of a broadcast from a grid of exactly 2 s, read once from the library at the
 beginning; broadcasts sent between, because something had changed, are not counted as
 late or early ones. Answer: from the moment when nobody speaks any more after a box's
@@ -45,11 +55,13 @@ SUPPLY: Final = 32.0
 LIFE: Final = {
     "away": [1.0, 8.0],
     "hesitates": [0.0, 4.0],
-    "wants_wh": [20.0, 150.0],
+    "wants_wh": [5.0, 60.0],
     "stays": [1.0, 6.0],
 }
 """Habits of the cars: all of it within a minute."""
 SEED: Final = 3
+FOLLOWED: Final = 3.0
+"""By then all boxes have their new share, s."""
 TOO_LONG: Final = 5.0
 """No time without a broadcast may be longer, s."""
 
@@ -211,11 +223,52 @@ async def _set_points(times: int) -> list[Figure]:
             chargers = list(bus.chargers.values())
             await until_all_charge(witness, chargers)
             called = await set_points(chargers, times)
-            await asyncio.sleep(0.5)
+            say("one box lowered, so that the other may go up")
+            freed, given_back = await _shares(bus, times // 5)
         finally:
             await bus.stop()
         offers = await witness.offers()
-    return set_point_figures(NAME, "", called, offers)
+    return [
+        *set_point_figures(NAME, "", called, offers),
+        *_share_figures("one lowered to the other risen", freed, offers),
+        *_share_figures("one raised to its share offered", given_back, offers),
+    ]
+
+
+async def _shares(bus: Bus, times: int) -> tuple[list[Called], list[Called]]:
+    """Let one box down and up again; return what is to be seen at the two boxes."""
+    dice = Random(SEED)  # noqa: S311 - repeatable on purpose
+    loop = asyncio.get_running_loop()
+    one, other = bus.chargers.values()
+    if bus.duty is not None:
+        await bus.duty.change_supply(Supply(limit=HIGH + LOW))
+    await asyncio.sleep(FOLLOWED)
+    freed: list[Called] = []
+    given_back: list[Called] = []
+    for _ in range(times):
+        for seen, charger, amps, ordered in (
+            (freed, other, HIGH, LOW),
+            (given_back, one, (HIGH + LOW) / 2, HIGH),
+        ):
+            begin = loop.time()
+            await one.change_orders(OrderChange(current=ordered))
+            seen.append(Called(charger.config.key, amps, begin, loop.time()))
+            await asyncio.sleep(FOLLOWED + dice.uniform(*PAUSES))
+    return freed, given_back
+
+
+def _share_figures(
+    name: str, called: Sequence[Called], offers: Sequence[Offer]
+) -> list[Figure]:
+    waited = [offered_after(one, offers) for one in called]
+    there = [one for one in waited if one is not None]
+    note = f"{len(there)} of {len(called)} followed"
+    if not there:
+        return [_count(f"{name}: never", len(called), note=note)]
+    return [
+        _milliseconds(f"{name}, {words}", percentile(there, share), note=note)
+        for words, share in (("p50", 0.5), ("p99", 0.99))
+    ]
 
 
 def _milliseconds(
