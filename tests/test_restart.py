@@ -34,6 +34,7 @@ from tests.virtual import (
     Car,
     EvboxChargePoint,
     Module,
+    SmartEvse,
     VirtualBus,
     orders_in,
 )
@@ -204,13 +205,18 @@ async def test_disabled_and_enabled_again(hass: HomeAssistant) -> None:
 async def test_nothing_to_complain_about(
     hass: HomeAssistant, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """No deprecation, no warning, from start to end, of both protocols."""
-    for box in (AblBox(1), EvboxChargePoint(1923054, 2, min_interval=0)):
+    """No deprecation, no warning, from start to end, of every protocol."""
+    for box in (
+        AblBox(1),
+        EvboxChargePoint(1923054, 2, min_interval=0),
+        SmartEvse(),
+        SmartEvse(load_balance=2),
+    ):
         async with running(hass, box, poll_interval=0.3) as (entry, _):
-            await get_entity(hass, "sensor", entry, "1_current_l1")
+            await get_entity(hass, "binary_sensor", entry, "1_charging")
             await hass.config_entries.async_reload(entry.entry_id)
             await hass.async_block_till_done()
-            await get_entity(hass, "sensor", entry, "1_current_l1")
+            await get_entity(hass, "binary_sensor", entry, "1_charging")
         await hass.config_entries.async_remove(entry.entry_id)
         await hass.async_block_till_done()
     complaints = [

@@ -45,7 +45,7 @@ async def test_it_stops_with_home_assistant(
         await entry.runtime_data.orders.async_flush()
         orders = hass_storage[STORE]["data"]
 
-        await stop(hass)
+        await hass.async_stop(force=True)
         assert not box.access
         assert access_writes(box)[-1] == 0
         await bus.wait_for_async(lambda: not box.contactor)
