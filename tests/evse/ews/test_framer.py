@@ -28,7 +28,10 @@ FIRMWARE_WITHOUT_ID = FIRMWARE[:-1] + b"\x27"
 STATUS = answer("rc", PORTS)
 
 _names = st.sampled_from([*CommandId])
-_answers = st.builds(answer, _names, st.binary(max_size=120), counts_id=st.booleans())
+# The head of a record inside is looked at twice; tests of their own have it there.
+_answers = st.builds(
+    answer, _names, st.binary(max_size=120), counts_id=st.booleans()
+).filter(lambda raw: b"\x02\x00\x0bI" not in raw[1:])
 _noise = st.binary(max_size=20).map(lambda data: data.replace(b"\x02", b"\x03"))
 
 
@@ -161,6 +164,7 @@ def test_a_record_never_changes_an_answer(
     places = data.draw(st.lists(st.integers(0, len(wire) + 16), max_size=8))
     # Three bytes or less of the record may make up an answer's end by chance.
     assume(not len(wire) - 4 < at < len(wire))
+    assume(b"\x02\x00\x0bI" not in content)
     frames, _ = feed(*cut(wire[:at] + record + wire[at:], places))
     assert sorted(raws(frames)) == sorted([record, wire])
 
