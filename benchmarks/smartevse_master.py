@@ -240,6 +240,8 @@ async def _shares(bus: Bus, times: int) -> tuple[list[Called], list[Called]]:
     dice = Random(SEED)  # noqa: S311 - repeatable on purpose
     loop = asyncio.get_running_loop()
     one, other = bus.chargers.values()
+    for charger in (one, other):
+        await charger.change_orders(OrderChange(current=HIGH))
     if bus.duty is not None:
         await bus.duty.change_supply(Supply(limit=HIGH + LOW))
     await asyncio.sleep(FOLLOWED)
