@@ -1,14 +1,15 @@
 """What a polled SmartEVSE is told when Home Assistant stops: only what was chosen."""
 
 import asyncio
-import sys
+from collections.abc import Awaitable, Callable
 from typing import Any
 
 from homeassistant.const import EVENT_HOMEASSISTANT_STOP
 from homeassistant.core import HomeAssistant
 import pytest
 
-from custom_components.evse_bus import farewell
+from custom_components.evse_bus import farewell as last_word
+from custom_components.evse_bus.evse.smartevse import PolledSmartEvse
 from tests.common import call, get_entity, running, state_of, wait_for_state
 from tests.smartevse import ACCESS, access_writes, car, shorten_quiet
 from tests.virtual import SmartEvse
@@ -24,7 +25,7 @@ async def stop(hass: HomeAssistant) -> None:
 
 @pytest.fixture
 def short_patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(farewell, "PATIENCE", 0.5)
+    monkeypatch.setattr(last_word, "PATIENCE", 0.5)
 
 
 @pytest.mark.parametrize("dialect", ACCESS)
@@ -143,20 +144,31 @@ async def test_an_unplugged_adapter_holds_nothing_up(
     assert "Charger 0 was not told that Home Assistant stops" in caplog.text
 
 
+async def fail(_charger: object) -> None:
+    message = "unforeseen"
+    raise RuntimeError(message)
+
+
+async def hang(_charger: object) -> None:
+    await asyncio.Event().wait()
+
+
+@pytest.mark.usefixtures("short_patience")
+@pytest.mark.parametrize(
+    ("farewell", "said"),
+    [(fail, "RuntimeError('unforeseen')"), (hang, "TimeoutError()")],
+)
 async def test_a_mistake_of_ours_holds_nothing_up(
     hass: HomeAssistant,
     caplog: pytest.LogCaptureFixture,
     monkeypatch: pytest.MonkeyPatch,
+    farewell: Callable[[object], Awaitable[None]],
+    said: str,
 ) -> None:
-    charger = sys.modules["custom_components.evse_bus.evse.smartevse.charger"]
-
-    async def fail(_self: object) -> None:
-        message = "unforeseen"
-        raise RuntimeError(message)
-
-    monkeypatch.setattr(charger.PolledSmartEvse, "farewell", fail)
+    monkeypatch.setattr(PolledSmartEvse, "farewell", farewell)
     async with running(hass, SmartEvse()) as (entry, bus):
         await get_entity(hass, "sensor", entry, "1_status")
-        await stop(hass)
+        async with asyncio.timeout(5):
+            await stop(hass)
         await bus.wait_for_async(lambda: not bus.connected)
-    assert "RuntimeError('unforeseen')" in caplog.text
+    assert f"Charger 0 was not told that Home Assistant stops: {said}" in caplog.text

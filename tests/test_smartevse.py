@@ -121,6 +121,11 @@ async def test_a_limit_of_nothing_leaves_it_allowed(hass: HomeAssistant) -> None
         await bus.wait_for_async(lambda: box.writes and not box.access)
         allowed = await get_entity(hass, "switch", entry, "charging_allowed")
         limit = await get_entity(hass, "number", entry, "charging_current")
+        status = await get_entity(hass, "sensor", entry, "1_status")
+        # It says that it may not charge.
+        await wait_for_state(hass, status, "unavailable")
+        polls = box.requests
+        await bus.wait_for_async(lambda: box.requests > polls + 2)
         await wait_for_state(hass, allowed, "on")
         assert state_of(hass, limit) == "0.0"
         await call(hass, "number.set_value", limit, value=8)
