@@ -164,7 +164,8 @@ def split(limit: int, minimum: int, claims: Iterable[Claim]) -> dict[int, int]:
         if LOWEST <= need <= limit:
             limit -= need
             shares[claim.unit] = need
-            wishes[claim.unit] = claim.wish
+            if need < claim.wish:
+                wishes[claim.unit] = claim.wish
     while wishes and (part := limit // len(wishes)) > 0:
         for unit, wish in tuple(wishes.items()):
             more = min(part, wish - shares[unit])
