@@ -2,7 +2,14 @@
 
 from homeassistant.core import HomeAssistant
 
-from tests.common import entity_id, get_entity, running, state_of, wait_for_state
+from tests.common import (
+    call,
+    entity_id,
+    get_entity,
+    running,
+    state_of,
+    wait_for_state,
+)
 from tests.virtual import AblBox, Car, EvboxChargePoint, Module
 
 
@@ -112,3 +119,14 @@ async def test_a_meter_that_jumps_is_no_consumption(hass: HomeAssistant) -> None
         await hass.async_block_till_done()
         assert set(seen) <= {"1.0", "unknown", "unavailable"}
         await wait_for_state(hass, energy, "1.0")
+
+
+async def test_the_fail_safe_is_told_as_it_is(hass: HomeAssistant) -> None:
+    """An ABL box has one only when it was switched on in the box."""
+    async with running(hass, AblBox(1)) as (entry, _):
+        own = await get_entity(hass, "switch", entry, "upstream_timeout")
+        fail_safe = await get_entity(hass, "sensor", entry, "fail_safe")
+        await call(hass, "switch.turn_off", own)
+        await wait_for_state(hass, fail_safe, "nothing")
+        await call(hass, "switch.turn_on", own)
+        await wait_for_state(hass, fail_safe, "stops")
