@@ -10,6 +10,7 @@ import pytest
 from pytest_homeassistant_custom_component.common import MockConfigEntry
 
 from custom_components.evse_bus.const import DOMAIN
+from custom_components.evse_bus.diagnostics import async_get_config_entry_diagnostics
 from tests.common import (
     call,
     charger,
@@ -266,6 +267,8 @@ async def test_another_master(hass: HomeAssistant) -> None:
         assert state_of(hass, status) == "unavailable"
         allowed = entity_id(hass, "switch", entry, "charging_allowed")
         assert state_of(hass, allowed) == "unavailable"
+        master = (await async_get_config_entry_diagnostics(hass, entry))["master"]
+        assert (master["silent"], master["noticed"]) == (True, ["second_master"])
         # What they share can be said all the same; it counts when we speak again.
         supply = bus_entity(hass, "number", "shared_supply")
         await call(hass, "number.set_value", supply, value=9)
