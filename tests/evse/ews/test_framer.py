@@ -3,6 +3,7 @@
 from functools import reduce
 from itertools import pairwise
 from operator import xor
+from time import process_time
 from typing import TYPE_CHECKING
 
 from hypothesis import assume, given, strategies as st
@@ -247,6 +248,23 @@ def test_garbage_does_not_pile_up(chunks: list[bytes]) -> None:
     for chunk in chunks:
         framer.feed(chunk)
         assert framer.pending < LONGEST_FRAME + 16
+
+
+@pytest.mark.parametrize(
+    "pattern", ["02", "0200", "0203ff80", "0203ff41727302", "02000b496966", "020004"]
+)
+def test_garbage_does_not_take_long(pattern: str) -> None:
+    """64 KiB of what looks like heads; a stranger on the network may send it."""
+    garbage = bytes.fromhex(pattern) * (0x10000 * 2 // len(pattern))
+    before = process_time()
+    feed(garbage)
+    assert process_time() - before < 2
+
+
+def test_a_message_that_another_ends_is_a_bad_one() -> None:
+    frames, framer = feed(STATUS[:50] + FIRMWARE)
+    assert raws(frames) == [FIRMWARE]
+    assert (framer.bad, framer.noise) == (1, 50)
 
 
 @given(st.integers(1, 6))

@@ -7,8 +7,6 @@ record begin with two letters that name it (manual, 3.2.2, 3.2.3).
 
 from dataclasses import dataclass, field
 from enum import Enum, IntEnum, StrEnum
-from functools import reduce
-from operator import xor
 from typing import Final, override
 
 from ..errors import RefusedOrderError
@@ -109,7 +107,12 @@ def checksum(content: bytes, bcc: Bcc) -> int:
     """Return the BCC over what stands between STX and BCC."""
     if bcc is Bcc.WITHOUT_MESSAGE_ID:
         content = content[:2] + content[3:]
-    return reduce(xor, content, 0)
+    # Folded in halves: garbage from a network must not keep anybody busy.
+    folded, left = int.from_bytes(content), len(content)
+    while left > 1:
+        left = (left + 1) // 2
+        folded = folded >> 8 * left ^ folded & (1 << 8 * left) - 1
+    return folded
 
 
 def encode(message_id: int, parameters: bytes, bcc: Bcc) -> bytes:
@@ -312,12 +315,12 @@ def _record_inside(buffer: bytes, at: int, end: int, least: int) -> bool:
 
     ``least``: so many of its bytes must have come.
     """
-    while (at := buffer.find(STX_BYTE, at + 1, end)) >= 0:
-        record = buffer[at : at + _INFO_LENGTH]
-        if (
-            len(record) >= least
-            and _INFO_HEAD.startswith(record[:_HEAD])
-            and (len(record) < _INFO_LENGTH or _reading(record) is not None)
-        ):
+    inside = at
+    while (inside := buffer.find(_INFO_HEAD, inside + 1, end + _HEAD - 1)) >= 0:
+        record = buffer[inside : inside + _INFO_LENGTH]
+        if len(record) < _INFO_LENGTH or _reading(record) is not None:
             return True
-    return False
+    return any(
+        at < len(buffer) - come < end and buffer.endswith(_INFO_HEAD[:come])
+        for come in range(least, _HEAD)
+    )
