@@ -8,28 +8,28 @@ from homeassistant.exceptions import HomeAssistantError, ServiceValidationError
 import pytest
 
 from custom_components.evse_bus.errors import not_ready, translated_errors
-from custom_components.evse_bus.evse import model
+from custom_components.evse_bus.evse import errors as library
 from tests.common import setup_bus
 from tests.flow import english
 from tests.virtual import AblBox, VirtualBus
 
 
-def all_errors() -> list[type[model.EvseError]]:
+def all_errors() -> list[type[library.EvseError]]:
     return [
         kind
-        for kind in vars(model).values()
-        if isinstance(kind, type) and issubclass(kind, model.EvseError)
+        for kind in vars(library).values()
+        if isinstance(kind, type) and issubclass(kind, library.EvseError)
     ]
 
 
-def make(kind: type[model.EvseError]) -> model.EvseError:
-    if kind is model.WrongChargerError:
-        return model.WrongChargerError("other", expected="1111", found="2222")
+def make(kind: type[library.EvseError]) -> library.EvseError:
+    if kind is library.WrongChargerError:
+        return library.WrongChargerError("other", expected="1111", found="2222")
     return kind("the charger's own reason")
 
 
 @pytest.mark.parametrize("kind", all_errors())
-def test_every_error_is_said_in_words(kind: type[model.EvseError]) -> None:
+def test_every_error_is_said_in_words(kind: type[library.EvseError]) -> None:
     with (
         pytest.raises(HomeAssistantError) as said,
         translated_errors("Garage", "/dev/ttyUSB0"),
@@ -42,30 +42,30 @@ def test_every_error_is_said_in_words(kind: type[model.EvseError]) -> None:
     assert isinstance(error.__cause__, kind)
     # A wish that cannot be meant is the caller's mistake, all else is not.
     assert isinstance(error, ServiceValidationError) == issubclass(
-        kind, model.RefusedOrderError
+        kind, library.RefusedOrderError
     )
 
 
 def test_a_wrong_charger_is_named() -> None:
     with pytest.raises(HomeAssistantError) as said, translated_errors("Garage", "p"):
-        raise make(model.WrongChargerError)
+        raise make(library.WrongChargerError)
     assert said.value.translation_placeholders["found"] == "2222"
     assert said.value.translation_placeholders["expected"] == "1111"
 
 
 def test_the_chargers_own_reason_is_kept() -> None:
     with pytest.raises(HomeAssistantError) as said, translated_errors("Garage", "p"):
-        raise model.ExchangeRefusedError("exception code 3", 3)
+        raise library.ExchangeRefusedError("exception code 3", 3)
     assert said.value.translation_placeholders["error"] == "exception code 3"
 
 
 def test_ports_differ() -> None:
     kinds = (
-        model.PortMissingError,
-        model.PortBusyError,
-        model.PortPermissionError,
-        model.PortSettingsError,
-        model.LineError,
+        library.PortMissingError,
+        library.PortBusyError,
+        library.PortPermissionError,
+        library.PortSettingsError,
+        library.LineError,
     )
     keys = {not_ready(kind("why"), "/dev/ttyUSB0").translation_key for kind in kinds}
     assert len(keys) == len(kinds)
