@@ -258,7 +258,7 @@ def test_garbage_does_not_take_long(pattern: str) -> None:
     garbage = bytes.fromhex(pattern) * (0x10000 * 2 // len(pattern))
     before = process_time()
     feed(garbage)
-    assert process_time() - before < 2
+    assert process_time() - before < 0.6
 
 
 def test_a_message_that_another_ends_is_a_bad_one() -> None:
