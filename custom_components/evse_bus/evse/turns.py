@@ -7,7 +7,7 @@ yields the pauses, in seconds; what it does between two pauses is one turn.
 from collections.abc import AsyncGenerator, Callable
 from functools import partial
 
-from .errors import NotConfirmedError, ReplyTimeoutError
+from .errors import LineBusyError, NotConfirmedError, ReplyTimeoutError
 from .exchange import Talk
 from .jobs import Later, Step
 
@@ -19,7 +19,8 @@ def in_turns(conversation: Callable[[Talk], Turns]) -> Step[None]:
     """Return the first turn of a conversation; each turn brings the next one.
 
     The first turn may be repeated: it begins the conversation anew. A later one may
-    not, so an answer that stays away there raises NotConfirmedError.
+    not, so an answer that stays away there, or a line on which others keep talking,
+    raises NotConfirmedError.
     """
 
     async def first(talk: Talk) -> Later[None] | None:
@@ -33,7 +34,8 @@ async def _go_on(turns: Turns, _talk: Talk) -> Later[None] | None:
     # conversation goes on with its first.
     try:
         return await _advance(turns)
-    except ReplyTimeoutError as error:
+    except (ReplyTimeoutError, LineBusyError) as error:
+        # Repeated, it would be at its end at once, and look as if it had gone well.
         raise NotConfirmedError(str(error)) from error
 
 
