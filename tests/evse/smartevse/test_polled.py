@@ -274,21 +274,6 @@ def test_a_short_power_failure(dialect: Dialect) -> None:
     play(PolledScene(dialect), acts)
 
 
-def test_a_firmware_without_the_override() -> None:
-    """It says no, and means it: the limit is not taken, and that is said."""
-
-    async def acts(scene: PolledScene) -> None:
-        scene.car.plug_in()
-        await scene.until(lambda: Fault.LIMIT_NOT_TAKEN in scene.charger.faults)
-        with pytest.raises(NotConfirmedError):
-            await scene.charger.change_orders(OrderChange(current=8))
-        await scene.charger.change_orders(OrderChange(allowed=False))
-        assert scene.box.offers == 0
-        assert Fault.LIMIT_NOT_TAKEN not in scene.charger.faults
-
-    play(PolledScene(V2_17, override_works=False), acts)
-
-
 @each
 def test_a_box_that_ignores_the_access_bit(dialect: Dialect) -> None:
     async def acts(scene: PolledScene) -> None:

@@ -33,6 +33,8 @@ class SmartEvseBox(SmartEvseReader):
     def __init__(self, config: ChargerConfig, orders: Orders) -> None:
         """Take the set-up; the box is not known before it answers."""
         super().__init__(config, orders)
+        self.must_close = False
+        """A setting may have opened the access that was off: to be closed again."""
         self._garbled = 0
         self._conversations: set[object] = set()
         self._set_up = SetUp(self)
@@ -59,8 +61,13 @@ class SmartEvseBox(SmartEvseReader):
                 self.tell(Fault.DUPLICATE_ADDRESS, present=True)
             raise
         self._garbled = 0
-        self.tell(Fault.DUPLICATE_ADDRESS, present=False)
+        self.tell(Fault.DUPLICATE_ADDRESS, present=self.shares_address)
         return later or self.what_now(talk.now)
+
+    @property
+    def shares_address(self) -> bool:
+        """Return whether others on its bus hear what is said to it."""
+        return False
 
     def turns(self, conversation: Callable[[Talk], Turns]) -> Step[None]:
         """Return the first turn of a conversation with this box."""
@@ -82,10 +89,14 @@ class SmartEvseBox(SmartEvseReader):
 
     def must_tend(self, now: float) -> bool:
         """Return whether something is to be asked or said beside the status."""
-        return now >= self.configuration_due
+        return now >= self.configuration_due or self.must_close
 
     async def tend(self, talk: Talk) -> Turns:
         """Ask and say what is due; what is not answered is for another time."""
+        if self.must_close:
+            async for pause in self.close_again(talk):
+                yield pause
+            yield 0.0
         if talk.now >= self.configuration_due:
             async for pause in self.read_configuration(talk):
                 yield pause
@@ -138,6 +149,9 @@ class SmartEvseBox(SmartEvseReader):
 
         for _ in range(WRITES):
             await self.write(talk, request, MAPS[dialect].access_register)
+            if allowed:
+                # The user's word, or a limit that gives back: open it may be.
+                self.must_close = False
             for pause in (0.0, LOOK_AGAIN):
                 yield pause
                 async for wait in self.see(talk):
@@ -148,6 +162,16 @@ class SmartEvseBox(SmartEvseReader):
         what = "on" if allowed else "off"
         message = f"{self.config.name} does not turn its access {what}"
         raise NotConfirmedError(message)
+
+    async def close_again(self, talk: Talk) -> Turns:
+        """Turn access off where a setting has opened it, until it is certain."""
+        async for pause in self.see(talk):
+            yield pause
+        if self.status is None or self.status.access:
+            yield 0.0
+            async for pause in self.set_access(talk, allowed=False):
+                yield pause
+        self.must_close = False
 
     def _has_access(self, allowed: bool) -> bool:  # noqa: FBT001
         if self.status is None:

@@ -28,7 +28,7 @@ from ..model import (
     Orders,
     Persistence,
 )
-from ..safety import Setpoint, clamp
+from ..safety import Setpoint, clamp, expired
 from ..schedule import Kind
 from ..turns import Turns
 from .box import WRITES
@@ -57,6 +57,8 @@ class PolledSmartEvse(PolledBox):
         self._looked_at = 0.0
         self._limit_paused = False
         """Our own 0 A has turned its access off; a higher limit gives it back."""
+        self._defied: float | None = None
+        """What it offered whatever it was told, A: access was turned off for that."""
 
     @property
     @override
@@ -91,7 +93,12 @@ class PolledSmartEvse(PolledBox):
             # Offered more than it had already obeyed.
             self._fell_back = self._confirmed == setpoint
         self._confirmed = setpoint if within else None
-        if not self._must_stop() and (within or not charging):
+        if status.access and not self.setpoint.paused:
+            # Somebody has opened it: what was to be given back is given back.
+            self._limit_paused = False
+            self._defied = None
+        settled = self._defied is None and not self._must_stop()
+        if settled and (within or not charging):
             self.tell(Fault.LIMIT_NOT_TAKEN, present=False)
 
     def _is_above(self, status: Status, setpoint: Setpoint | None = None) -> bool:
@@ -146,6 +153,9 @@ class PolledSmartEvse(PolledBox):
             self.tell(Fault.LIMIT_NOT_TAKEN, present=True)
             raise
         self._limit_paused = ours and (had_access or self._limit_paused)
+        if not ours:
+            self._defied = None
+            self.tell(Fault.LIMIT_NOT_TAKEN, present=False)
 
     def _must_write(self) -> bool:
         status = self.status
@@ -179,8 +189,10 @@ class PolledSmartEvse(PolledBox):
     async def _follow(self, talk: Talk, wanted: Callable[[], Setpoint]) -> Turns:
         """Write the override; while a car charges, until it is read back.
 
-        Raises NotConfirmedError when the box offers more than was written.
+        A box that goes on offering more is stopped: a limit is a promise. Raises
+        NotConfirmedError then.
         """
+        told = status = None
         for _ in range(WRITES):
             async for pause in self.reach(talk):
                 yield pause
@@ -190,7 +202,7 @@ class PolledSmartEvse(PolledBox):
             if self._fell_back:
                 self.statistics.reasserted += 1
                 self._fell_back = False
-            await self._write_current(talk, status, wanted)
+            told = await self._write_current(talk, status, wanted)
             if status.raw_state not in CHARGING:
                 return
             if self.known_dialect is not Dialect.LATER:
@@ -198,20 +210,35 @@ class PolledSmartEvse(PolledBox):
             async for pause in self._settle(talk, wanted):
                 yield pause
             status = self.status
+            setpoint = wanted()
             if (
                 status is None
                 or status.raw_state not in CHARGING
-                or not self._is_above(status, wanted())
+                or setpoint.paused
+                or not self._is_above(status, setpoint)
             ):
                 return
             yield 0.0
+        if status is None or told != tenths(wanted()):
+            # A newer order has not had its time yet.
+            message = f"{self.config.name} has not followed its limit yet"
+            raise NotConfirmedError(message)
+        offers = offered(self.known_dialect, status)
+        async for pause in self._stop(talk, ours=True):
+            yield pause
+        self._defied = offers
         self.tell(Fault.LIMIT_NOT_TAKEN, present=True)
-        message = f"{self.config.name} does not follow its limit"
+        message = (
+            f"{self.config.name} offers {offers:g} A whatever it is told, and has been "
+            "stopped: set MAX in its menu to what may flow, or make it a slave of Home "
+            "Assistant (firmware 2.17 as released takes no limit when it is polled)"
+        )
         raise NotConfirmedError(message)
 
     async def _write_current(
         self, talk: Talk, status: Status, wanted: Callable[[], Setpoint]
-    ) -> None:
+    ) -> int:
+        """Write the override; return what was sent, 0.1 A."""
         dialect = self.known_dialect
         sent: list[int] = []
 
@@ -224,7 +251,8 @@ class PolledSmartEvse(PolledBox):
             return write_current(self.config.address, dialect, setpoint)
 
         answer = await self.write(talk, request, MAPS[dialect].current_register)
-        self._written = None if answer is None or not sent else sent[-1]
+        self._written = None if answer is None else sent[-1]
+        return sent[-1]
 
     async def _settle(self, talk: Talk, wanted: Callable[[], Setpoint]) -> Turns:
         """Look until the box offers what was written, or had the time to."""
@@ -265,7 +293,7 @@ class PolledSmartEvse(PolledBox):
         try:
             async for pause in self._prepare(talk, change):
                 yield pause
-            if clamp(self.target(change), self.limits).paused:
+            if self._wanted(change).paused:
                 if self._must_pause(change):
                     ours = orders.allowed is not False
                     async for pause in self._stop(talk, ours=ours):
@@ -296,11 +324,17 @@ class PolledSmartEvse(PolledBox):
             self.status is None or not is_stopped(self.known_dialect, self.status)
         )
 
+    def _wanted(self, change: OrderChange) -> Setpoint:
+        """Return where a change leads; who only sets the fail-safe renews nothing."""
+        target = self.target(change)
+        orders = expired(target) if self.orders_expired else target
+        return clamp(orders, self.limits)
+
     async def _allow(self, talk: Talk, change: OrderChange) -> Turns:
         """Let the box follow orders that let a car charge."""
 
         def wanted() -> Setpoint:
-            return clamp(self.target(change), self.limits)
+            return self._wanted(change)
 
         async for pause in self._follow(talk, wanted):
             yield pause
@@ -315,6 +349,7 @@ class PolledSmartEvse(PolledBox):
         async for pause in self.set_access(talk, allowed=True, still=still):
             yield pause
         self._limit_paused = False
+        self._defied = None
 
     def _may_start(self, change: OrderChange) -> bool:
         """Return whether access is to be turned on: nobody's change of a limit does.
@@ -331,6 +366,7 @@ class PolledSmartEvse(PolledBox):
             and self._limit_paused
             and self.target(change).allowed is not False
             and (self.status is None or not self.status.access)
+            and self._wanted(change).current >= (self._defied or 0.0)
         )
 
     # -- Commands --------------------------------------------------------------------

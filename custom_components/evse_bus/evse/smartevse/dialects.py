@@ -85,6 +85,8 @@ class Map:
     current_register: int
     access_register: int
     mode_register: int
+    socket: int
+    """Register: 0 socket, 1 fixed cable."""
     load_balancing: int
     """Register: 0 disabled, 1 master, else slave."""
     configuration: tuple[Block, ...]
@@ -120,6 +122,7 @@ MAPS: Final[Mapping[Dialect, Map]] = {
         current_register=0xA6,
         access_register=0xA7,
         mode_register=0xA8,
+        socket=0xC0,
         load_balancing=0xC1,
         configuration=(Block(0xC0, 9), Block(0xE0, 3)),
         settings={
@@ -140,6 +143,7 @@ MAPS: Final[Mapping[Dialect, Map]] = {
         current_register=0xA6,
         access_register=0xA7,
         mode_register=0xA8,
+        socket=0xC0,
         load_balancing=0xC1,
         configuration=(Block(0xC0, 10), Block(0xE0, 3)),
         settings={
@@ -166,6 +170,7 @@ MAPS: Final[Mapping[Dialect, Map]] = {
         current_register=0x0002,
         access_register=0x0005,
         mode_register=0x0003,
+        socket=0x0100,
         load_balancing=0x0104,
         configuration=(Block(0x0100, 5), Block(0x0200, 8)),
         settings={

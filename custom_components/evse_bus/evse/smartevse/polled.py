@@ -7,6 +7,7 @@ pause does not wait for its end. PROTOCOLS.md, 3.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import ClassVar, Final, override
 
@@ -17,7 +18,7 @@ from ..model import ChargerConfig, Fault, Orders
 from ..turns import Turns, in_turns
 from .box import SmartEvseBox
 from .dialects import Dialect
-from .timing import QUIET
+from .timing import QUIET, TIMING
 
 COMMANDS_FIRST: Final = 0.05
 """A poll comes so much later than the end of the quiet, s."""
@@ -27,6 +28,9 @@ class PolledBox(SmartEvseBox):
     """One SmartEVSE that has no master, or is its own."""
 
     pauses_hurry: ClassVar = True
+    # A power failure opens access that was off: a box that is back is soon seen, and
+    # one that hears us and is not heard still has its quiet.
+    timing: ClassVar = replace(TIMING, backoff=QUIET, backoff_limit=QUIET)
 
     def __init__(self, config: ChargerConfig, orders: Orders) -> None:
         """Take the set-up; the box is not known before it answers."""
@@ -80,15 +84,19 @@ class PolledBox(SmartEvseBox):
         self._check_alone()
         return await super().write(talk, request, register)
 
+    @property
+    @override
+    def shares_address(self) -> bool:
+        others = self.bus is not None and len(self.bus.chargers) > 1
+        return self.config.address == 0 and others
+
     def _check_alone(self) -> None:
         """Raise DuplicateAddressError where a write would reach others too.
 
         2.17 without load balancing has the address at which all others listen.
         """
-        others = self.bus is not None and len(self.bus.chargers) > 1
-        shared = self.config.address == 0 and others
-        self.tell(Fault.DUPLICATE_ADDRESS, present=shared)
-        if shared:
+        if self.shares_address:
+            self.tell(Fault.DUPLICATE_ADDRESS, present=True)
             message = (
                 f"{self.config.name} has address 0, at which every SmartEVSE listens: "
                 "nothing is written while others are on its bus"

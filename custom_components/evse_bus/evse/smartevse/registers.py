@@ -172,9 +172,14 @@ def decode_configuration(
                 raise ImplausibleReplyError(message)
             settings[setting] = kept.value(word)
         load_balancing = words[layout.load_balancing]
+        socket = words[layout.socket]
     except KeyError as error:
         message = f"register {error} was not told"
         raise ImplausibleReplyError(message) from error
+    if socket not in _ZERO_OR_ONE:
+        # In 2.17 a status that comes late is as long, and looks like settings else.
+        message = f"a box has a socket or a fixed cable, not {socket}"
+        raise ImplausibleReplyError(message)
     if load_balancing not in UNITS:
         message = f"load balancing cannot be {load_balancing}"
         raise ImplausibleReplyError(message)

@@ -59,10 +59,11 @@ class SetUp:
             if self._is_set(setting, value):
                 # What is set already is not written: the memory wears out.
                 return
-            had_access = box.status is None or box.status.access
+            # Remembered until it is certain: answers may be lost, or the line.
+            box.must_close |= box.status is not None and not box.status.access
             async for pause in self._write(setting, value, talk):
                 yield pause
-            if not had_access:
+            if box.must_close:
                 async for pause in self._close(talk):
                     yield pause
             async for pause in self._read_back(talk):
@@ -112,12 +113,7 @@ class SetUp:
         """Turn access off again where the write has opened it."""
         box = self._box
         try:
-            async for pause in box.see(talk):
-                yield pause
-            yield 0.0
-            if box.status is not None and not box.status.access:
-                return
-            async for pause in box.set_access(talk, allowed=False):
+            async for pause in box.close_again(talk):
                 yield pause
             yield 0.0
         except EvseError as error:

@@ -19,6 +19,7 @@ CHARGING: Final = frozenset({"C", "D"})
 STOPPING: Final = "C1"
 """No current is offered; the contactor opens within 6 s."""
 
+_CLOSED: Final = (UNPLUGGED, "B1", STOPPING)
 _STOPPED_BY: Final = frozenset({Fault.NO_COMM, Fault.TEMP_HIGH, Fault.RCD})
 """Faults of box or installation; the others mean that there is no current now."""
 
@@ -83,9 +84,10 @@ def tells_plug(dialect: Dialect, status: Status) -> bool:
 
 def is_stopped(dialect: Dialect, status: Status) -> bool:
     """Return whether a box with access off has also obeyed it."""
-    if status.access or status.raw_state in CHARGING:
+    if status.access:
         return False
-    return dialect is Dialect.LATER or status.raw_state == UNPLUGGED
+    # A later one that wakes a car up (T) goes on to B, and from there to C.
+    return status.raw_state in (_CLOSED if dialect is Dialect.LATER else (UNPLUGGED,))
 
 
 def offered(dialect: Dialect, status: Status) -> float | None:
