@@ -12,6 +12,7 @@ from custom_components.evse_bus.evse.model import OrderChange, Supply
 from custom_components.evse_bus.evse.smartevse.master import SLACK
 
 from .balancing import (
+    REPEATS,
     Asked,
     Shared,
     broadcasts,
@@ -116,7 +117,9 @@ async def _busy(seconds: float, *, dead: bool = False) -> list[Figure]:
         _given(what, house),
     ]
     if not dead:
-        figures[-1:-1] = _answers([one for one in requests(log) if one.end > begin])
+        # What came at the very end had no time to be answered.
+        asked = [one for one in requests(log) if begin < one.end < end - REPEATS]
+        figures[-1:-1] = _answers(asked)
     return figures
 
 
