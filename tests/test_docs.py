@@ -22,12 +22,13 @@ def script(page: str) -> str:
 def test_the_readme_knows_how_often_is_asked() -> None:
     every = {
         key: f"{default_of(PROTOCOLS[key], 'poll_interval'):g} s"
-        for key in ("evbox", "abl")
+        for key in ("evbox", "abl", "smartevse", "smartevse_master")
     }
+    assert every["abl"] == every["smartevse"] == every["smartevse_master"]
     readme = " ".join((ROOT / "README.md").read_text().split())
-    assert f"EVBox {every['evbox']}, ABL {every['abl']}" in readme
+    assert f"EVBox {every['evbox']}, ABL and SmartEVSE {every['abl']}" in readme
     assert f"an EVBox every {every['evbox']}" in readme
-    assert f"an ABL box every {every['abl']}" in readme
+    assert f"an ABL box or a SmartEVSE every {every['abl']}" in readme
 
 
 async def test_the_script_of_the_library_reads_and_sets_a_charger() -> None:
