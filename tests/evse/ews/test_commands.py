@@ -128,6 +128,11 @@ def test_st_that_is_no_limit(current: float) -> None:
         set_limit(1, setpoint(current))
 
 
+def test_a_pause_is_no_limit() -> None:
+    with pytest.raises(RefusedOrderError, match="switch the limit off"):
+        set_limit(1, setpoint(0.0))
+
+
 @pytest.mark.parametrize("current", [float("nan"), float("inf"), float("-inf")])
 def test_st_that_is_no_number(current: float) -> None:
     with pytest.raises(RefusedOrderError):
