@@ -146,7 +146,7 @@ class Charger(ABC):
     ) -> Later[None] | None:
         """Make the charger follow these orders, through `clamp`; return when sure.
 
-        They are the `target` of the change, which may be another one in a later turn.
+        They are what is `sought` by the change, which may be another one in a later turn.
         ``change`` is what made these orders of those before: only where it says
         ``allowed=True`` has the user switched charging on just now; a box that is
         paused stays so after any other change. May take further turns.
@@ -274,7 +274,7 @@ class Charger(ABC):
 
     async def _impose_job(self, job: Job, talk: Talk) -> Later[None] | None:
         change = job.change or OrderChange()
-        result = await self.impose(talk, self.target(change), change)
+        result = await self.impose(talk, self.sought(change), change)
         return await self._imposed(change, result)
 
     async def _imposed(
@@ -311,6 +311,14 @@ class Charger(ABC):
         own sending.
         """
         return cautious(change.apply(self.orders), self._wish)
+
+    def sought(self, change: OrderChange) -> Orders:
+        """Return the orders to be imposed for a change: its target, unless expired.
+
+        Who sets only the fail-safe renews nothing.
+        """
+        target = self.target(change)
+        return expired(target) if self.orders_expired else target
 
     def expire_orders(self, now: float) -> bool:
         """Note that the orders' lifetime is over; return whether it just ended."""

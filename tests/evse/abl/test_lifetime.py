@@ -71,3 +71,15 @@ async def test_a_fail_safe_of_nothing_ends_with_the_next_limit() -> None:
         await scene.polled(charger)
         await charger.change_orders(limit(10))
         assert scene.writes() == [166, PAUSE, 166]
+
+
+async def test_a_new_fail_safe_renews_nothing() -> None:
+    box = AblBox(1, car=plugged())
+    async with Scene(box) as scene:
+        charger = await scene.settled(
+            config(order_lifetime=0.8), orders(16, allowed=True, fail_safe=8)
+        )
+        await until(lambda: scene.writes() == [133])
+        await charger.change_orders(OrderChange(fail_safe_current=6))
+        await scene.polled(charger)
+        assert scene.writes() == [133, 100]

@@ -440,6 +440,20 @@ def test_expired_orders_become_the_fail_safe() -> None:
     simulate(scene())
 
 
+def test_expired_orders_stay_so_while_the_fail_safe_changes() -> None:
+    async def scene() -> None:
+        async with Scene.of(box()) as stage:
+            charger = stage.add(order_lifetime=60.0)
+            await asyncio.sleep(70.0)
+            since = len(stage.ether.orders)
+            await charger.change_orders(OrderChange(fail_safe_current=8.0))
+            await asyncio.sleep(70.0)
+            sent = [order.limits for order in stage.ether.orders[since:]]
+            assert set(sent) == {(8.0, 8.0, 8.0)}
+
+    simulate(scene())
+
+
 # -- What is not believed ------------------------------------------------------------
 
 

@@ -135,7 +135,7 @@ class AblCharger(AblReader):
                 return
             async for pause in self.enforce(
                 talk,
-                lambda: clamp(self.target(change), self.limits),
+                lambda: clamp(self.sought(change), self.limits),
                 starts=change.allowed is True,
             ):
                 yield pause

@@ -161,7 +161,7 @@ class EvboxCharger(Charger):
     async def impose(self, talk: Talk, orders: Orders, change: OrderChange) -> None:
         """Send these orders; a believed answer confirms them."""
         try:
-            await self._converse(talk, lambda: self.target(change))
+            await self._converse(talk, lambda: self.sought(change))
         except ImplausibleReplyError as error:
             # Said again, it is believed at last: let the bus repeat it.
             self.statistics.implausible += 1

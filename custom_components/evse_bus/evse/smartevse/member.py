@@ -119,7 +119,7 @@ class Member(SmartEvseBox):
     def _standing(self) -> Orders:
         """Return the orders that count, with those that are just being confirmed."""
         if self._confirming is not None:
-            return self.target(self._confirming)
+            return self.sought(self._confirming)
         return self.effective_orders
 
     def setpoint_within(self, share: float) -> Setpoint:
