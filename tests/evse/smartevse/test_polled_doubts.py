@@ -261,3 +261,24 @@ def test_a_pause_while_a_later_box_wakes_its_car_up() -> None:
         assert scene.box.offers == 0
 
     play(PolledScene(LATER), acts)
+
+
+@each
+def test_a_start_half_done_does_not_outlive_the_farewell(dialect: Dialect) -> None:
+    async def acts(scene: PolledScene) -> None:
+        await scene.charge()
+        await scene.polled(4)
+        start = asyncio.create_task(
+            scene.charger.change_orders(OrderChange(allowed=True, current=12))
+        )
+        since = now()
+        await scene.until(lambda: scene.currents(since))
+        await asyncio.sleep(0.2)
+        await scene.charger.farewell()
+        await scene.bus.stop()
+        with suppress(EvseError):
+            await start
+        assert scene.accesses(since)[-1] == 0
+        assert not scene.outlet.access
+
+    play(PolledScene(dialect, stop_on_shutdown=True), acts)

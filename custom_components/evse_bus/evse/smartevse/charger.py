@@ -28,11 +28,10 @@ from ..model import (
     Orders,
     Persistence,
 )
-from ..safety import Setpoint, clamp, expired
-from ..schedule import Kind
+from ..safety import Setpoint, clamp
 from ..turns import Turns
 from .box import WRITES
-from .config import PolledConfig, polled_config
+from .config import PolledConfig
 from .dialects import MAPS, Dialect
 from .mode import mode_conversation
 from .polled import PolledBox
@@ -192,7 +191,7 @@ class PolledSmartEvse(PolledBox):
         A box that goes on offering more is stopped: a limit is a promise. Raises
         NotConfirmedError then.
         """
-        told = status = None
+        told = None
         for _ in range(WRITES):
             async for pause in self.reach(talk):
                 yield pause
@@ -219,7 +218,16 @@ class PolledSmartEvse(PolledBox):
             ):
                 return
             yield 0.0
-        if status is None or told != tenths(wanted()):
+        async for pause in self._give_up(talk, judged=told == tenths(wanted())):
+            yield pause
+
+    async def _give_up(self, talk: Talk, *, judged: bool) -> Turns:
+        """Stop a box that does not follow; ``judged``: it had its time.
+
+        Raises NotConfirmedError, always.
+        """
+        status = self.status
+        if status is None or not judged:
             # A newer order has not had its time yet.
             message = f"{self.config.name} has not followed its limit yet"
             raise NotConfirmedError(message)
@@ -325,10 +333,7 @@ class PolledSmartEvse(PolledBox):
         )
 
     def _wanted(self, change: OrderChange) -> Setpoint:
-        """Return where a change leads; who only sets the fail-safe renews nothing."""
-        target = self.target(change)
-        orders = expired(target) if self.orders_expired else target
-        return clamp(orders, self.limits)
+        return clamp(self.sought(change), self.limits)
 
     async def _allow(self, talk: Talk, change: OrderChange) -> Turns:
         """Let the box follow orders that let a car charge."""
@@ -344,7 +349,7 @@ class PolledSmartEvse(PolledBox):
 
         def still() -> bool:
             # Not where a pause came meanwhile: that one is on its way.
-            return not wanted().paused
+            return not (wanted().paused or self.leaves)
 
         async for pause in self.set_access(talk, allowed=True, still=still):
             yield pause
@@ -380,17 +385,6 @@ class PolledSmartEvse(PolledBox):
             return
         conversation = mode_conversation(self, value)
         await self.run(self.turns(conversation), persistence=Persistence.REPEATABLE)
-
-    # -- The end ---------------------------------------------------------------------
-
-    @override
-    async def farewell(self) -> None:
-        if polled_config(self.config).stop_on_shutdown:
-            await self.run(
-                self.turns(partial(self.set_access, allowed=False)),
-                persistence=Persistence.STANDING,
-                kind=Kind.PAUSE,
-            )
 
 
 __all__ = ["PolledConfig", "PolledSmartEvse"]

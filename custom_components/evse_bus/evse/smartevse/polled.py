@@ -14,9 +14,11 @@ from typing import ClassVar, Final, override
 from ..errors import DuplicateAddressError, LineBusyError
 from ..exchange import Request, Talk
 from ..jobs import Later, Step
-from ..model import ChargerConfig, Fault, Orders
+from ..model import ChargerConfig, Fault, Orders, Persistence
+from ..schedule import Kind
 from ..turns import Turns, in_turns
 from .box import SmartEvseBox
+from .config import polled_config
 from .dialects import Dialect
 from .timing import QUIET, TIMING
 
@@ -37,6 +39,8 @@ class PolledBox(SmartEvseBox):
         super().__init__(config, orders)
         self._needs_quiet = False
         self._last_request = 0.0
+        self.leaves = False
+        """It was stopped for good: Home Assistant goes."""
 
     # -- When ------------------------------------------------------------------------
 
@@ -102,6 +106,20 @@ class PolledBox(SmartEvseBox):
                 "nothing is written while others are on its bus"
             )
             raise DuplicateAddressError(message)
+
+    # -- The end ---------------------------------------------------------------------
+
+    @override
+    async def farewell(self) -> None:
+        if not polled_config(self.config).stop_on_shutdown:
+            return
+        # A start half done would come to its end after this.
+        self.leaves = True
+        await self.run(
+            self.turns(partial(self.set_access, allowed=False)),
+            persistence=Persistence.STANDING,
+            kind=Kind.PAUSE,
+        )
 
 
 async def _in_one_go(conversation: Callable[[Talk], Turns], talk: Talk) -> Turns:
