@@ -21,6 +21,7 @@ from .errors import (
     LineError,
     LineLostError,
     NotAvailableError,
+    PortMissingError,
 )
 from .exchange import Talk, Wire
 from .framing import Frame, Framer, Timing
@@ -61,6 +62,8 @@ class Bus:
         self.chargers: dict[str, Charger] = {}
         self.connected = False
         """The port is open."""
+        self.shared: object | None = None
+        """What its chargers know together, where they are connectors of one box."""
         self._jobs = JobQueue()
         self._task: asyncio.Task[None] | None = None
         self._stopping = False
@@ -79,18 +82,23 @@ class Bus:
     async def start(self) -> None:
         """Open the port and start; one that runs already goes on.
 
-        Raises LineError when the port cannot be opened, NotAvailableError when
-        `stop` came first.
+        A line that the other end opens is waited for. Raises LineError when the port
+        cannot be opened, NotAvailableError when `stop` came first.
         """
         if self._task is not None:
             return
         self._stopping = False
-        await self.line.open()
+        try:
+            await self.line.open()
+        except PortMissingError:
+            if not self.line.opened_by_peer:
+                raise
         if self._stopping:
             await self.line.close()
             message = f"{self.name} was stopped while it started"
             raise NotAvailableError(message)
-        self._on_open()
+        if self.line.is_open:
+            self._on_open()
         self._task = asyncio.create_task(self._run(), name=f"bus {self.name}")
 
     async def stop(self) -> None:
@@ -202,6 +210,11 @@ class Bus:
     def supersede(self, charger: Charger, which: Callable[[OrderChange], bool]) -> None:
         """Drop waiting order changes that a newer command makes wrong."""
         self._jobs.supersede(charger, which)
+
+    @property
+    def now(self) -> float:
+        """Return the loop time, s."""
+        return asyncio.get_running_loop().time()
 
     def look_again(self) -> None:
         """Choose anew who speaks next: something has changed."""

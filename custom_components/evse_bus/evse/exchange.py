@@ -73,6 +73,7 @@ class Wire:
         counted: ChargerStatistics,
         *,
         reply_may_equal: bool = False,
+        patience: float = 0.0,
     ) -> T:
         """Send a request and wait for its answer (see `Talk.exchange`)."""
         self.sent_at = None
@@ -86,12 +87,12 @@ class Wire:
         self.sent_at = sent
         pending = _PendingReply(
             accept,
-            first_byte_by=sent + self.timing.reply_timeout,
+            first_byte_by=sent + self.timing.reply_timeout + patience,
             longest=self.timing.longest_reply * self.line.settings.byte_time,
             gap=self.timing.gap,
         )
         self._pending = pending
-        self.frames.add(Direction.OUT, data)
+        self.frames.add(Direction.OUT, self._framer.shown(data))
         self.statistics.requests += 1
         counted.requests += 1
         try:
@@ -127,7 +128,7 @@ class Wire:
         self._framer.reset()
         sent = self.line.write(data)
         self.sent_at = sent
-        self.frames.add(Direction.OUT, data)
+        self.frames.add(Direction.OUT, self._framer.shown(data))
         self.statistics.sent_only += 1
         # The line is ours until the last byte has left.
         await asyncio.sleep(sent - asyncio.get_running_loop().time())
@@ -154,10 +155,10 @@ class Wire:
         if framer.bad > bad or framer.noise > noise:
             self.statistics.bad_frames += framer.bad - bad
             self.statistics.noise_bytes += framer.noise - noise
-            self.frames.add(Direction.UNREADABLE, data)
+            self.frames.add(Direction.UNREADABLE, framer.shown(data))
         for frame in frames:
             self.statistics.frames += 1
-            self.frames.add(Direction.IN, frame.raw)
+            self.frames.add(Direction.IN, framer.shown(frame.raw))
             self._on_frame(frame)
         if self._pending is not None and framer.pending:
             self._pending.goes_on()
@@ -198,6 +199,7 @@ class Talk:
         accept: Callable[[F], T | None],
         *,
         reply_may_equal: bool = False,
+        patience: float = 0.0,
     ) -> T:
         """Send a request and return what ``accept`` makes of its answer.
 
@@ -207,11 +209,18 @@ class Talk:
         ``accept`` sees every good frame that comes: it returns ``None`` for one
         that is not the answer, and raises for an answer that says no.
 
+        ``patience`` is added to the reply time-out, s: the turn must have been given
+        the time for it (`Later.worst_case`).
+
         Raises ReplyTimeoutError, GarbledReplyError, LineBusyError, LineLostError
         and what ``accept`` raises.
         """
         return await self._wire.exchange(
-            request, accept, self._counted, reply_may_equal=reply_may_equal
+            request,
+            accept,
+            self._counted,
+            reply_may_equal=reply_may_equal,
+            patience=patience,
         )
 
     async def send(self, request: Request) -> float:

@@ -82,3 +82,7 @@ class Framer[F: Frame](ABC):
     @abstractmethod
     def pending(self) -> int:
         """Return the number of bytes of a frame begun and not ended."""
+
+    def shown(self, raw: bytes) -> bytes:
+        """Return bytes that passed as they may stand in a log: nothing private."""
+        return raw

@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 import errno
 import socket
-from typing import TYPE_CHECKING, override
+from typing import TYPE_CHECKING, ClassVar, override
 
 from serialx import Parity, SerialException, StopBits, create_serial_connection
 
@@ -80,6 +80,9 @@ class LineStatistics:
 
 class Line:
     """One serialx connection, half duplex."""
+
+    opened_by_peer: ClassVar[bool] = False
+    """The other end opens it: that it has not yet is no error, and a wait is all."""
 
     def __init__(self, url: str, settings: LineSettings) -> None:
         """Remember where and how; nothing is opened yet."""

@@ -111,6 +111,13 @@ class Capability(StrEnum):
     SET_ADDRESS = "set_address"
     MODE = "mode"
     TEMPERATURE = "temperature"
+    SESSION = "session"
+    """Energy and time of the charge under way, and of the last one."""
+    CABLE_CURRENT = "cable_current"
+    LOCK = "lock"
+    CONTACTOR = "contactor"
+    OPTIMISED = "optimised"
+    START_REQUEST = "start_request"
 
 
 class Persistence(StrEnum):
@@ -139,6 +146,13 @@ class Command(StrEnum):
     """Value: bool, a plugged car may charge after a power failure."""
     SET_MODE = "set_mode"
     """Value: a `Mode`; forgotten when the charger restarts."""
+    STOP_AND_UNLOCK = "stop_and_unlock"
+    REQUEST_START = "request_start"
+    """As if the start key of the charger was pressed."""
+    LOCK = "lock"
+    """Lock the plug of a car that waits for its start."""
+    SET_OPTIMISED = "set_optimised"
+    """Value: bool, the next start is an optimised one."""
 
 
 class Mode(StrEnum):
@@ -335,6 +349,24 @@ class ConnectorReading:
     """Estimated power summed since this object began to listen, Wh."""
     minimum_current: float | None = None
     """Current below which this connector cannot charge, A."""
+    session_energy: float | None = None
+    """Of the charge under way, Wh."""
+    session_time: int | None = None
+    """Of the charge under way, s."""
+    last_session_energy: float | None = None
+    """Of the last charge, Wh."""
+    last_session_time: int | None = None
+    """Of the last charge, s."""
+    cable_current: float | None = None
+    """Rated current of the cable, A."""
+    locked: bool | None = None
+    """The plug is locked."""
+    contactor: bool | None = None
+    """The contactor is closed."""
+    optimised: bool | None = None
+    """The next start is an optimised one."""
+    start_requested: bool | None = None
+    """Somebody wants to charge, and waits for our permission."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

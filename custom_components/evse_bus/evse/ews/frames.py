@@ -204,6 +204,10 @@ class EwsFramer(Framer[EwsFrame]):
         self._buffer = b""
 
     @override
+    def shown(self, raw: bytes) -> bytes:
+        return redacted(raw)
+
+    @override
     def feed(self, data: bytes) -> list[EwsFrame]:
         buffer = self._buffer + data
         found: list[EwsFrame] = []

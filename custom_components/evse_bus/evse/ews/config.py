@@ -1,0 +1,39 @@
+"""What the user sets up for one port of an EWS-Box."""
+
+from dataclasses import dataclass
+from datetime import tzinfo
+
+from ..model import ChargerConfig
+from .commands import PORTS
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EwsPortConfig(ChargerConfig):
+    """One port; its address is its number, 1 or 2. Both are of the box of their bus.
+
+    Raises ValueError for another number.
+    """
+
+    poll_interval: float = 2.0
+    """s; the manual's own proposal (3.2.3). The box hangs up after 30 s of silence."""
+    time_zone: tzinfo | None = None
+    """Zone in which the box's clock is kept right; ``None``: it is left alone."""
+
+    def __post_init__(self) -> None:
+        """Check the number."""
+        if self.address not in PORTS:
+            message = f"{self.address} is no port of an EWS-Box (1, 2)"
+            raise ValueError(message)
+
+    @property
+    def port(self) -> int:
+        """Return the number of the port."""
+        return self.address
+
+
+def ews_config(config: ChargerConfig) -> EwsPortConfig:
+    """Return the set-up as this protocol's own; TypeError for another one's."""
+    if not isinstance(config, EwsPortConfig):
+        message = f"{config.name} is not set up as a port of an EWS-Box"
+        raise TypeError(message)
+    return config

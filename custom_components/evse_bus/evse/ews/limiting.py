@@ -1,0 +1,192 @@
+"""The limit of a port: ``st`` until ``rd`` tells it, and whenever it tells another.
+
+The limit is lost when the box is switched off, and 0 takes it away: so what is said
+while charging is paused is the limit that counts when it goes on, and at least 6 A.
+"""
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+from ..errors import NotAvailableError, NotConfirmedError, ReplyTimeoutError
+from ..exchange import Talk
+from ..model import MINIMUM_CURRENT, CurrentLimit, Fault, Orders
+from ..safety import Setpoint, clamp
+from ..turns import Turns
+from .answers import EwsRefusedError
+from .commands import set_limit
+from .frames import CommandId, Request
+from .states import STARTING
+from .timing import LOOK_AGAIN, READY_PATIENCE, READY_PAUSE
+
+if TYPE_CHECKING:
+    from .charger import EwsPort
+
+SENDS: Final = 2
+"""How often a limit is said until it must be read back."""
+LOOKS: Final = 3
+"""How often it is looked for after each."""
+_LOWEST: Final = Orders(limit=CurrentLimit(current=MINIMUM_CURRENT))
+
+
+class Limiter:
+    """The limit of one port."""
+
+    def __init__(self, port: EwsPort) -> None:
+        """Take the port."""
+        self._port = port
+        self._confirmed: int | None = None
+        """What was said and read back, or something lower, A."""
+        self._other: tuple[int, int] | None = None
+        """What was said, and what ``rd`` told and was taken for it, A."""
+
+    def forget(self) -> None:
+        """Note that the box may have forgotten its limit."""
+        self._confirmed = self._other = None
+
+    # -- What is to be so ----------------------------------------------------------
+
+    def wanted(self, orders: Orders) -> Setpoint | None:
+        """Return what the limit is to be for these orders, paused or not.
+
+        ``None``: it cannot be said (no pilot in mode 1; not even 6 A are left).
+        """
+        port = self._port
+        installation = port.box.installation
+        if installation is None or installation.mode_1[port.port - 1]:
+            return None
+        limits = port.limits
+        for one in (replace(orders, allowed=None), _LOWEST):
+            setpoint = clamp(one, limits)
+            if not setpoint.paused and setpoint.current > 0:
+                return setpoint
+        return None
+
+    @property
+    def told(self) -> int | None:
+        """Return the limit that ``rd`` told last, A; 0: none."""
+        details = self._port.box.details
+        return None if details is None else details.limit[self._port.port - 1]
+
+    def _is_taken(self, wanted: int) -> bool:
+        """Return whether the box offers no more than that, by what it told last."""
+        told, seen = self.told, self._port.seen
+        if told:
+            return told <= wanted
+        # Without a word of ours in it, what it offers must do.
+        offered = seen.offered_current if seen is not None else None
+        return told == 0 and bool(offered) and offered is not None and offered <= wanted
+
+    def must_assert(self) -> bool:
+        """Return whether the limit is to be said."""
+        setpoint = self.wanted(self._port.effective_orders)
+        told = self.told
+        if setpoint is None or told is None or self._port.seen is None:
+            return False
+        wanted = int(setpoint.current)
+        if told == wanted:
+            return False
+        return self._other != (wanted, told) or not self._is_taken(wanted)
+
+    def check(self) -> None:
+        """Take the fault away when all is well again."""
+        port = self._port
+        if self.must_assert() or port.permission.must_pause(port.setpoint):
+            return
+        port.tell(Fault.LIMIT_NOT_TAKEN, present=False)
+
+    def count(self) -> None:
+        """Count a limit that stood, and is said again because the box is above it."""
+        if self._confirmed is not None and not self._is_taken(self._confirmed):
+            self._port.statistics.reasserted += 1
+
+    # -- Saying it -----------------------------------------------------------------
+
+    async def enforce(self, talk: Talk, orders: Callable[[], Orders]) -> Turns:
+        """Say the limit until it is read back, at it or below it.
+
+        Raises NotConfirmedError when the box does not follow, EwsRefusedError when it
+        says so, and what `EwsPort.look` raises.
+        """
+        port = self._port
+        patience = talk.now + READY_PATIENCE
+        sends = 0
+        while sends < SENDS:
+            async for pause in port.ready(talk):
+                yield pause
+            # The cable counts as well, and is seen right now only.
+            seen = await port.look(talk)
+            if self.wanted(orders()) is None:
+                return
+            sends += 1
+            try:
+                said = await self._say(talk, orders)
+            except EwsRefusedError:
+                if seen.status == STARTING and talk.now < patience:
+                    sends -= 1
+                    yield READY_PAUSE
+                    continue
+                yield 0.0
+                async for pause in self._at_least_lowest(talk):
+                    yield pause
+                port.tell(Fault.LIMIT_NOT_TAKEN, present=True)
+                raise
+            yield 0.0
+            for _ in range(LOOKS):
+                async for pause in port.ready(talk):
+                    yield pause
+                if said is not None and await self._is_read_back(talk, said):
+                    return
+                yield LOOK_AGAIN
+        port.tell(Fault.LIMIT_NOT_TAKEN, present=True)
+        message = f"{port.config.name} does not follow its limit"
+        raise NotConfirmedError(message)
+
+    async def _say(self, talk: Talk, orders: Callable[[], Orders]) -> int | None:
+        """Say it; return what was said, A: a lost answer may have been heard."""
+        port = self._port
+        said: list[int] = []
+
+        def request() -> Request:
+            setpoint = self.wanted(orders())
+            if setpoint is None:
+                message = f"{port.config.name}: no current may be offered"
+                raise NotAvailableError(message)
+            said.append(int(setpoint.current))
+            return set_limit(port.port, setpoint)
+
+        self._confirmed = self._other = None
+        with suppress(ReplyTimeoutError):
+            await port.box.tell(talk, CommandId.SET_LIMIT, request)
+        return said[-1] if said else None
+
+    async def _is_read_back(self, talk: Talk, said: int) -> bool:
+        port = self._port
+        try:
+            await port.box.look(talk)
+            port.take()
+            await port.box.look_closer(talk)
+        except ReplyTimeoutError:
+            return False
+        port.take()
+        told = self.told
+        if told is None or not self._is_taken(said):
+            return False
+        self._confirmed = said
+        self._other = (said, told)
+        port.tell(Fault.LIMIT_NOT_TAKEN, present=False)
+        return True
+
+    async def _at_least_lowest(self, talk: Talk) -> Turns:
+        """Say 6 A to a box that refused, and stands above the order."""
+        port = self._port
+        wanted = self.wanted(port.effective_orders)
+        if wanted is None or self._is_taken(int(wanted.current)):
+            return
+        async for pause in port.ready(talk):
+            yield pause
+        try:
+            await self._say(talk, lambda: _LOWEST)
+        except EwsRefusedError:
+            return

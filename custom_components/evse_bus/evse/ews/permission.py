@@ -1,0 +1,299 @@
+"""Letting a car charge or not: ``sl`` 6 and ``sl`` 3, each in its states only.
+
+A second 6 unlocks the cable, and a 3 in the wrong state starts whoever comes next. So
+each is sent right after an ``rc``, in the same turn of the bus; a 6 is not said again
+before the port had the time to follow; and after a lost answer the state decides.
+"""
+
+from collections.abc import Callable
+from math import inf
+from typing import TYPE_CHECKING, Final
+
+from ..errors import (
+    NotAvailableError,
+    NotConfirmedError,
+    ReplyTimeoutError,
+    SupersededError,
+)
+from ..exchange import Talk
+from ..model import Fault, OrderChange
+from ..safety import Setpoint, clamp, expired
+from ..turns import Turns
+from .answers import EwsRefusedError, Refusal
+from .commands import start_stop
+from .frames import CommandId, Request
+from .readings import RUNNING
+from .states import (
+    ABORTED,
+    AFTER_OUR_PAUSE,
+    BLOCKED,
+    CHARGING,
+    CHARGING_OPTIMISED,
+    ENDED,
+    FREE,
+    SEARCHING,
+    STARTING,
+    WAITING,
+    StartStop,
+)
+from .status import PortStatus, StartRelease
+from .timing import LOOK_AGAIN, READY_PATIENCE, READY_PAUSE, SETTLING
+
+if TYPE_CHECKING:
+    from .charger import EwsPort
+
+SENDS: Final = 2
+"""How often one order is said at most in one conversation."""
+_CHARGING: Final = (CHARGING, CHARGING_OPTIMISED)
+_NOTHING_TO_START: Final = (FREE, SEARCHING, ENDED, ABORTED, BLOCKED)
+"""No car waits for a start: permission is given, and there is nothing to say."""
+
+
+def _may_have_paused(port: EwsPort) -> bool:
+    orders = [port.orders]
+    if port.config.order_lifetime is not None:
+        orders.append(expired(port.orders))
+    return any(clamp(one, port.limits).paused for one in orders)
+
+
+class Permission:
+    """What a port has been allowed, as far as it is our doing."""
+
+    def __init__(self, port: EwsPort) -> None:
+        """Take the port; what an earlier run of ours has paused nobody knows."""
+        self._port = port
+        self.paused: bool | None = None if _may_have_paused(port) else False
+        """We have paused this charge; ``None``: perhaps (an answer was lost, or it was
+        before our time)."""
+        self.waits_for_current = False
+        """Our own 0 A has paused it: a higher limit lets it go on."""
+        self._said_at = -inf
+        self._started_at = -inf
+        self._was_locked = False
+        self._energy = 0
+        self._time = 0
+
+    def forget(self) -> None:
+        """Note that the box was restarted: it knows of no pause."""
+        self.paused = False
+        self.waits_for_current = False
+
+    # -- What is known -------------------------------------------------------------
+
+    def watch(self, seen: PortStatus) -> None:
+        """See whether our pause still stands."""
+        if self.paused is False:
+            return
+        other = seen.session_time < self._time or seen.session_energy < self._energy
+        self._time, self._energy = seen.session_time, seen.session_energy
+        unlocked = self._was_locked and seen.locked is False
+        self._was_locked = bool(seen.locked)
+        still = seen.status in AFTER_OUR_PAUSE and not unlocked and not other
+        # Said a moment ago: it may not have followed yet.
+        still |= seen.status in _CHARGING and self._is_settling()
+        if not still:
+            self.paused = False
+            self._was_locked = False
+            self.waits_for_current &= seen.status in _CHARGING
+
+    def _is_settling(self) -> bool:
+        bus = self._port.bus
+        return bus is not None and bus.now < self._said_at + SETTLING
+
+    def is_paused(self, seen: PortStatus) -> bool:
+        """Return whether the port stands in our pause."""
+        return self.paused is True and seen.status in AFTER_OUR_PAUSE
+
+    def is_session(self, seen: PortStatus, *, was: bool) -> bool:
+        """Return whether a charge is under way; in our pause it still is.
+
+        ``was``: it was when we looked last.
+        """
+        if seen.status in RUNNING or self.is_paused(seen):
+            return True
+        bus = self._port.bus
+        resumes = bus is not None and bus.now < self._started_at + SETTLING
+        return (
+            was and seen.status in AFTER_OUR_PAUSE and (self.paused is None or resumes)
+        )
+
+    def must_pause(self, setpoint: Setpoint) -> bool:
+        """Return whether a car charges, or may at any moment, that must not."""
+        seen = self._port.seen
+        return setpoint.paused and seen is not None and self._runs(seen)
+
+    def _runs(self, seen: PortStatus) -> bool:
+        """Return whether order 6 would pause a charge here, and not unlock.
+
+        In 0x42 and 0x43 that is only known where it is no pause of ours.
+        """
+        if seen.status in _CHARGING:
+            return True
+        return seen.status in RUNNING and self.paused is False
+
+    # -- Pausing -------------------------------------------------------------------
+
+    async def pause(self, talk: Talk, *, for_current: bool) -> Turns:
+        """Stop a charge under way, and keep the cable locked.
+
+        ``for_current``: only our limit of 0 A wants so. Raises NotConfirmedError when
+        it goes on, EwsRefusedError when the box says no, and what `EwsPort.look` raises.
+        """
+        port = self._port
+        sends = 0
+        if not for_current:
+            self.waits_for_current = False
+        while True:
+            async for pause in port.ready(talk):
+                yield pause
+            seen = await self._look_now(talk)
+            if not self._runs(seen):
+                break
+            if talk.now >= self._said_at + SETTLING:
+                if sends == SENDS:
+                    port.tell(Fault.LIMIT_NOT_TAKEN, present=True)
+                    message = f"{port.config.name} does not pause"
+                    raise NotConfirmedError(message)
+                sends += 1
+                await self._say_pause(talk, seen)
+            yield LOOK_AGAIN
+        if sends and self.paused is None and seen.status in AFTER_OUR_PAUSE:
+            # The answer was lost, and it has followed.
+            self.paused = True
+        if for_current and self.paused is not False:
+            self.waits_for_current = seen.status in AFTER_OUR_PAUSE
+
+    async def _look_now(self, talk: Talk) -> PortStatus:
+        """Look; once more if a record came that says it is not so any more."""
+        seen = await self._port.look(talk)
+        if self._port.box.ports_at == -inf:
+            seen = await self._port.look(talk)
+        return seen
+
+    async def _say_pause(self, talk: Talk, seen: PortStatus) -> None:
+        port = self._port
+        changes = port.box.changes
+
+        def request() -> Request:
+            if port.box.changes != changes:
+                message = f"{port.config.name}: something happens there right now"
+                raise SupersededError(message)
+            self._said_at = talk.now
+            # Until the answer nobody knows.
+            self.paused = None
+            self._time, self._energy = seen.session_time, seen.session_energy
+            self._was_locked = bool(seen.locked)
+            return start_stop(port.port, StartStop.PAUSE, seen)
+
+        try:
+            await port.box.tell(talk, CommandId.START_STOP, request)
+        except SupersededError:
+            return
+        except ReplyTimeoutError:
+            # Perhaps it was heard: the next look tells.
+            return
+        except EwsRefusedError:
+            self.paused = False
+            port.tell(Fault.LIMIT_NOT_TAKEN, present=True)
+            raise
+        self.paused = True
+
+    # -- Starting ------------------------------------------------------------------
+
+    def may_start(self, change: OrderChange) -> bool:
+        """Return whether a start is to be said: nobody's change of a limit does.
+
+        The user's word does, and a limit gives back what only a limit of 0 A took.
+        """
+        if change.allowed is True:
+            return True
+        asked = change.current is not None or any(
+            phase is not None for phase in change.phases
+        )
+        return asked and self.waits_for_current
+
+    async def start(self, talk: Talk, still: Callable[[], bool]) -> Turns:
+        """Let the car charge that waits, or that we have paused.
+
+        Where there is nothing to start, nothing is said. ``still`` is asked right
+        before each word. Raises NotAvailableError in a state in which nothing can be
+        started, EwsRefusedError, SupersededError, and what `EwsPort.look` raises.
+        """
+        port = self._port
+        patience = talk.now + READY_PATIENCE
+        said_at: float | None = None
+        sends = 0
+        while True:
+            async for pause in port.ready(talk):
+                yield pause
+            seen = await self._look_now(talk)
+            settled = said_at is None or talk.now >= said_at + SETTLING
+            if self._has_started(seen, settled=settled):
+                break
+            if seen.status == STARTING:
+                self._check_patience(talk, patience)
+                yield READY_PAUSE
+                continue
+            if not settled:
+                yield LOOK_AGAIN
+                continue
+            if sends == SENDS:
+                message = f"{port.config.name} does not start"
+                raise NotConfirmedError(message)
+            if seen.status in _NOTHING_TO_START and not self._goes_on(seen):
+                break
+            said_at, done = await self._say_start(talk, seen, still)
+            if done is None:
+                self._check_patience(talk, patience)
+                said_at = None
+                yield READY_PAUSE
+                continue
+            sends += 1
+            yield LOOK_AGAIN
+        self.waits_for_current = False
+
+    def _check_patience(self, talk: Talk, until: float) -> None:
+        if talk.now >= until:
+            message = f"{self._port.config.name} is still starting up"
+            raise NotAvailableError(message)
+
+    def _goes_on(self, seen: PortStatus) -> bool:
+        """Return whether a charge stands here that we have paused, perhaps."""
+        return self.paused is not False and seen.status in AFTER_OUR_PAUSE
+
+    def _has_started(self, seen: PortStatus, *, settled: bool) -> bool:
+        if seen.status in _CHARGING and not self._is_settling():
+            return True
+        if seen.status in RUNNING and self.paused is False:
+            return True
+        # Released: it locks the plug, and then waits for the car.
+        released = seen.start is StartRelease.RELEASED
+        return settled and released and seen.status == WAITING
+
+    async def _say_start(
+        self, talk: Talk, seen: PortStatus, still: Callable[[], bool]
+    ) -> tuple[float, bool | None]:
+        """Say it; return when, and whether it was taken (``None``: not ready yet)."""
+        port = self._port
+
+        def request() -> Request:
+            if not still():
+                raise SupersededError("a newer command came first")
+            paused = self.paused is not False
+            return start_stop(port.port, StartStop.START, seen, paused=paused)
+
+        try:
+            await port.box.tell(talk, CommandId.START_STOP, request)
+        except ReplyTimeoutError:
+            return talk.now, False
+        except EwsRefusedError as error:
+            if error.reason is Refusal.NOT_READY:
+                return talk.now, None
+            if error.reason is Refusal.WAITING_FOR_UNPLUG:
+                self.paused = False
+                self.waits_for_current = False
+            raise
+        self.paused = False
+        self._said_at = -inf
+        self._started_at = talk.now
+        return talk.now, True

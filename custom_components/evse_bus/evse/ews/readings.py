@@ -1,0 +1,153 @@
+"""What is made of what an EWS-Box tells: one charger's reading for each port.
+
+Pure functions. Manual, 3.2.4 (``rc``, ``rd``, ``rs``).
+"""
+
+from math import inf
+from typing import Final
+
+from ..model import (
+    MINIMUM_CURRENT,
+    Capability,
+    ChargerInfo,
+    ChargerReading,
+    ConnectorReading,
+    Limits,
+)
+from .box import BoxStatus
+from .session import Installation, Told
+from .states import CHARGING, PAUSED_OPTIMISED, WAITING, box_faults, port_state
+from .status import PortStatus, StartRelease
+
+MODE_1_CURRENT: Final = 16
+"""What a household socket carries, A: all or nothing (2.2.1)."""
+RUNNING: Final = range(CHARGING, PAUSED_OPTIMISED + 1)
+"""Status bytes of a charge under way, pauses included."""
+
+_MODE_3_ONLY: Final = frozenset(
+    {Capability.OFFERED_CURRENT, Capability.CABLE_CURRENT, Capability.LOCK}
+)
+_ALL: Final = _MODE_3_ONLY | {
+    Capability.STATUS,
+    Capability.RAW_STATE,
+    Capability.PLUGGED,
+    Capability.CHARGING,
+    Capability.POWER,
+    Capability.ENERGY,
+    Capability.MAXIMUM_CURRENT,
+    Capability.FAULTS,
+    Capability.RESET,
+    Capability.SESSION,
+    Capability.CONTACTOR,
+    Capability.OPTIMISED,
+    Capability.START_REQUEST,
+}
+
+
+def capabilities_of(
+    port: int, installation: Installation | None
+) -> frozenset[Capability]:
+    """Return what a port has; mode 1 has no pilot, a fixed cable no lock."""
+    if installation is None:
+        return _ALL
+    if installation.mode_1[port - 1]:
+        return _ALL - _MODE_3_ONLY
+    return _ALL - {Capability.LOCK} if installation.fixed_cable else _ALL
+
+
+def limits_of(
+    port: int,
+    own: float,
+    box: BoxStatus | None,
+    installation: Installation | None,
+    seen: PortStatus | None,
+) -> Limits:
+    """Return what no order may exceed; ``own``: the user's limit for the port, A.
+
+    The smallest of jumper (``rs``), parameter (``rp``, ``rz``) and cable (``rc``).
+    """
+    if installation is None or box is None or not box.maximum_current:
+        return Limits(installation=own, reports_maximum=True, step=1.0)
+    told = min(box.maximum_current, installation.maximum[port - 1] or inf)
+    minimum = MINIMUM_CURRENT
+    if installation.mode_1[port - 1]:
+        told = minimum = MODE_1_CURRENT
+    elif not installation.fixed_cable and seen is not None and seen.cable_current:
+        told = min(told, seen.cable_current)
+    return Limits(
+        installation=own,
+        reports_maximum=True,
+        reported=float(told),
+        minimum=float(minimum),
+        step=1.0,
+    )
+
+
+def charger_info(box: BoxStatus) -> ChargerInfo:
+    """Return what the box is."""
+    return ChargerInfo(
+        manufacturer="P-CHARGE",
+        model="EWS-Box",
+        serial=box.serial,
+        firmware=box.firmware or None,
+        options={
+            "website": box.website_version or None,
+            "card_reader": box.reader_firmware or None,
+        },
+    )
+
+
+def charger_reading(port: int, box: Told, *, paused: bool) -> ChargerReading:
+    """Return a port's reading; ``paused``: it is our pause that it is in."""
+    at = port - 1
+    seen, details, installation = box.ports[at], box.details, box.installation
+    state = port_state(seen, fixed_cable=installation.fixed_cable, paused=paused)
+    connector = ConnectorReading(
+        status=state.status,
+        raw_state=state.raw,
+        plugged=state.plugged,
+        charging=state.charging,
+        power=float(details.power[at]),
+        energy=float(seen.total_energy),
+        session_energy=float(seen.session_energy),
+        session_time=seen.session_time,
+        last_session_energy=float(seen.last_energy),
+        last_session_time=seen.last_time,
+        cable_current=float(seen.cable_current) if seen.cable_current else None,
+        locked=state.locked,
+        contactor=seen.contactor,
+        optimised=seen.optimised,
+        start_requested=seen.start is StartRelease.REQUESTED,
+    )
+    offered = 0 if paused else seen.offered_current
+    told = limits_of(port, inf, box.status, installation, None).reported
+    return ChargerReading(
+        connectors={1: connector},
+        allowed=_allowed(seen, paused=paused),
+        offered_current=None if offered is None else float(offered),
+        maximum_current=told,
+        faults=state.faults | box_faults(box.status),
+        details={
+            "limit": details.limit[at],
+            "pwm_duty": details.pwm_duty[at],
+            "pilot_code": details.pilot_code[at],
+            "cable_code": details.cable_code[at],
+            "pwm_minimum": seen.pwm_minimum,
+            "pwm_maximum": seen.pwm_maximum,
+            "cable_voltage": seen.cable_voltage,
+            "start_code": seen.start_code,
+            "result_code": seen.result_code,
+            "meter_cycles": seen.meter_cycles,
+        },
+    )
+
+
+def _allowed(seen: PortStatus, *, paused: bool) -> bool | None:
+    """Return whether a car may charge, as the box says it."""
+    if paused:
+        return False
+    if seen.status in RUNNING:
+        return True
+    if seen.status == WAITING:
+        return seen.start is StartRelease.RELEASED
+    return None

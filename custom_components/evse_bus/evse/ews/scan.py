@@ -1,0 +1,79 @@
+"""Looking for an EWS-Box on a bus; nothing is written.
+
+There is one box on a line, and its ports are its chargers. ``id`` is asked under both
+readings of the checksum (manual, 3.2.2).
+"""
+
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+from ..errors import (
+    ExchangeRefusedError,
+    GarbledReplyError,
+    ImplausibleReplyError,
+    LineBusyError,
+    ReplyTimeoutError,
+)
+from ..exchange import Talk
+from ..jobs import Later
+from ..model import ChargerConfig, FoundCharger, Orders, ScanReport
+from ..turns import in_turns
+from .readings import charger_info, limits_of
+from .session import EwsBox
+
+if TYPE_CHECKING:
+    from ..bus import Bus
+    from ..protocol import Progress
+
+TRIES: Final = 4
+"""How often a silent line is asked, under one reading and the other in turn."""
+
+
+async def scan(
+    bus: Bus, config: ChargerConfig, orders: Orders, progress: Progress
+) -> ScanReport:
+    """Look for a box; ``config`` and ``orders`` are not needed.
+
+    Raises LineLostError when the port is lost meanwhile.
+    """
+    del config, orders
+    box = EwsBox()
+    unreadable = 0
+    progress(0.0)
+    for attempt in range(TRIES):
+        try:
+            await bus.run(partial(_meet, box))
+        except GarbledReplyError:
+            unreadable += 1
+        except ReplyTimeoutError, LineBusyError:
+            pass
+        except ImplausibleReplyError, ExchangeRefusedError:
+            # It speaks as a box does, and is none that we understand.
+            unreadable += 1
+        if box.known and box.installation is not None:
+            progress(1.0)
+            return ScanReport(found=_found(box))
+        progress((attempt + 1) / TRIES)
+    return ScanReport(unreadable=unreadable == TRIES)
+
+
+async def _meet(box: EwsBox, talk: Talk) -> Later[None] | None:
+    return await in_turns(box.meet)(talk)
+
+
+def _found(box: EwsBox) -> tuple[FoundCharger, ...]:
+    status, installation = box.status, box.installation
+    if status is None or installation is None:
+        return ()
+    info = charger_info(status)
+    return tuple(
+        FoundCharger(
+            address=port,
+            info=info,
+            serial=status.serial,
+            maximum_current=limits_of(
+                port, float("inf"), status, installation, None
+            ).reported,
+        )
+        for port in range(1, installation.ports + 1)
+    )

@@ -1,0 +1,251 @@
+"""What an EWS-Box can do beside charging: cards, meter, LEDs, clock, parameters.
+
+All of it belongs to the box; any of its ports may carry it out. Nothing is logged: the
+blocks have names, cards and passwords in them.
+"""
+
+from collections.abc import Awaitable, Callable, Mapping
+from datetime import tzinfo
+from typing import TYPE_CHECKING, Final
+
+from ..errors import NotConfirmedError, RefusedOrderError, ReplyTimeoutError
+from ..exchange import Talk
+from ..jobs import Later
+from ..turns import Turns, in_turns
+from .answers import decode_card_reader
+from .box import Dhcp, decode_dhcp
+from .cards import (
+    AcceptedCard,
+    CardEntry,
+    CardList,
+    accept_card,
+    decode_cards,
+    write_cards,
+)
+from .commands import (
+    PortLeds,
+    ReaderTarget,
+    card_reader,
+    set_leds,
+    set_meter,
+)
+from .frames import CommandId, Request
+from .parameters import Block
+from .timing import LOOK_AGAIN
+
+if TYPE_CHECKING:
+    from .charger import EwsPort
+
+LOOKS: Final = 5
+"""How often something written is read back until it must stand there."""
+LONGEST_READER_TIMEOUT: Final = 10
+"""The box must hear the next command in time, s."""
+
+
+class Services:
+    """The services of one box, carried out in the turns of one of its ports."""
+
+    def __init__(self, port: EwsPort) -> None:
+        """Take the port."""
+        self._port = port
+
+    # -- Cards ---------------------------------------------------------------------
+
+    async def accept_card(self, card: AcceptedCard) -> None:
+        """Accept a card that the box does not know, or log somebody in (``ma``).
+
+        Raises RefusedOrderError, EwsRefusedError, NotConfirmedError (a lost answer),
+        and what `Charger.run` raises; so do all others here.
+        """
+        request = accept_card(card)
+        await self.in_a_turn(
+            lambda talk: self._port.box.tell(
+                talk, CommandId.ACCEPT_CARD, lambda: request
+            )
+        )
+
+    async def read_cards(self) -> CardList:
+        """Return the box's own list of cards (``rf``)."""
+        return await self.in_a_turn(self._read_cards)
+
+    async def write_cards(self, changes: Mapping[int, CardEntry]) -> CardList:
+        """Replace some entries (0 to 63), and nothing else; return the list (``sf``).
+
+        Raises NotConfirmedError when the list is not read back so.
+        """
+        wanted: list[CardList] = []
+
+        async def write(talk: Talk) -> None:
+            cards = (await self._read_cards(talk)).with_entries(changes)
+            wanted.append(cards)
+            await self._tell(talk, CommandId.WRITE_CARDS, write_cards(cards))
+
+        return await self._write_and_read(
+            write, self._read_cards, lambda cards: cards == wanted[-1], "its card list"
+        )
+
+    async def _read_cards(self, talk: Talk) -> CardList:
+        return await self._port.box.read(talk, CommandId.READ_CARDS, decode_cards)
+
+    async def card_reader(
+        self, target: ReaderTarget, patience: int, data: bytes
+    ) -> bytes:
+        """Hand a command to the card reader; return its answer (``mc``).
+
+        ``patience``: the reader's time-out, up to 10 s.
+        """
+        if patience not in range(LONGEST_READER_TIMEOUT + 1):
+            message = f"a time-out of {patience} s is not 0 to {LONGEST_READER_TIMEOUT}"
+            raise RefusedOrderError(message)
+        request = card_reader(target, patience, data)
+        return await self.in_a_turn(
+            lambda talk: self._port.box.ask(
+                talk,
+                CommandId.CARD_READER,
+                lambda: request,
+                decode_card_reader,
+                patience=patience,
+            ),
+            patience=patience,
+        )
+
+    # -- Meter, LEDs, clock, network -------------------------------------------------
+
+    async def set_meter(self, total: int) -> None:
+        """Set the meter total of this port, Wh (``cr``)."""
+        request = set_meter(self._port.port, total)
+        await self.in_a_turn(
+            lambda talk: self._port.box.tell(talk, CommandId.SET_METER, lambda: request)
+        )
+        self._port.hurry()
+
+    async def set_leds(self, first: PortLeds, second: PortLeds) -> None:
+        """Set the LEDs of both ports; only a box with manual keys and LEDs (``se``)."""
+        request = set_leds(first, second)
+        await self.in_a_turn(
+            lambda talk: self._port.box.tell(talk, CommandId.SET_LEDS, lambda: request)
+        )
+
+    async def set_clock(self, zone: tzinfo) -> None:
+        """Set the clock to the time in this zone, however wrong it is (``sc``)."""
+        await self.in_a_turn(lambda talk: self._port.box.set_clock(talk, zone))
+
+    async def read_dhcp(self) -> Dhcp:
+        """Return what DHCP gave the box (``rg``)."""
+        return await self.in_a_turn(
+            lambda talk: self._port.box.read(talk, CommandId.READ_DHCP, decode_dhcp)
+        )
+
+    # -- Parameters ------------------------------------------------------------------
+
+    async def read_parameters[T](self, block: Block[T]) -> T:
+        """Return a block of parameters (``rp ru ri rz``); passwords are in it."""
+        return await self.in_a_turn(
+            lambda talk: self._port.box.read(talk, block.read, block.decode)
+        )
+
+    async def change_parameters[T](
+        self, block: Block[T], changes: Mapping[str, object]
+    ) -> T:
+        """Change fields of a block, and nothing else; return it (``sp su si sz``).
+
+        It is read, changed and written in one turn, then read back. Raises
+        RefusedOrderError where a password would be erased that the box hides,
+        NotConfirmedError when a field is not read back so (over the network a box
+        keeps its server mode).
+        """
+        box = self._port.box
+
+        async def write(talk: Talk) -> None:
+            raw = await box.read(talk, block.read, bytes)
+            await self._tell(talk, block.write, block.change(raw, changes))
+
+        def stands(told: T) -> bool:
+            return all(
+                getattr(told, name) == value
+                for name, value in changes.items()
+                if name not in block.secrets
+            )
+
+        result = await self._write_and_read(
+            write,
+            lambda talk: box.read(talk, block.read, block.decode),
+            stands,
+            ", ".join(sorted(changes.keys() - block.secrets)) or "its secrets",
+        )
+        box.parameters_due = float("-inf")
+        return result
+
+    # -- Turns -----------------------------------------------------------------------
+
+    async def in_a_turn[T](
+        self, work: Callable[[Talk], Awaitable[T]], *, patience: float = 0.0
+    ) -> T:
+        """Do something in one turn of the bus, the box being known.
+
+        ``patience``: longer than a reply usually takes, s.
+        """
+        port = self._port
+        done: list[T] = []
+
+        async def talks(talk: Talk) -> Turns:
+            async for pause in port.ready(talk):
+                yield pause
+            try:
+                done.append(await work(talk))
+            except ReplyTimeoutError as error:
+                raise NotConfirmedError(str(error)) from error
+
+        async def first(_talk: Talk) -> Later[None] | None:
+            return Later(0.0, in_turns(talks), self._worst_case(patience))
+
+        await port.run(first)
+        return done[0]
+
+    def _worst_case(self, patience: float) -> float | None:
+        bus = self._port.bus
+        if bus is None or not patience:
+            return None
+        return bus.worst_case(self._port) + patience
+
+    async def _tell(self, talk: Talk, command: CommandId, request: Request) -> None:
+        """Write; a lost answer decides nothing, what is read back does."""
+        try:
+            await self._port.box.tell(talk, command, lambda: request)
+        except ReplyTimeoutError:
+            return
+
+    async def _write_and_read[T](
+        self,
+        write: Callable[[Talk], Awaitable[None]],
+        read: Callable[[Talk], Awaitable[T]],
+        stands: Callable[[T], bool],
+        what: str,
+    ) -> T:
+        """Write in one turn, then read until it stands there.
+
+        Raises NotConfirmedError when it does not.
+        """
+        port = self._port
+        told: list[T] = []
+
+        async def talks(talk: Talk) -> Turns:
+            async for pause in port.ready(talk):
+                yield pause
+            await write(talk)
+            for _ in range(LOOKS):
+                yield LOOK_AGAIN
+                async for pause in port.ready(talk):
+                    yield pause
+                try:
+                    found = await read(talk)
+                except ReplyTimeoutError:
+                    continue
+                if stands(found):
+                    told.append(found)
+                    return
+            message = f"{port.config.name} did not take {what}"
+            raise NotConfirmedError(message)
+
+        await port.run(in_turns(talks))
+        return told[0]

@@ -1,0 +1,318 @@
+"""A simulated line with one virtual EWS-Box on it; the wire is the witness."""
+
+import asyncio
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from random import Random
+from typing import Any, Self, override
+
+from custom_components.evse_bus.evse.bus import Bus
+from custom_components.evse_bus.evse.errors import LineLostError
+from custom_components.evse_bus.evse.ews import PROTOCOL
+from custom_components.evse_bus.evse.ews.charger import EwsPort
+from custom_components.evse_bus.evse.ews.config import EwsPortConfig
+from custom_components.evse_bus.evse.ews.events import Event
+from custom_components.evse_bus.evse.ews.timing import SETTINGS
+from custom_components.evse_bus.evse.framing import Timing
+from custom_components.evse_bus.evse.line import Line
+from custom_components.evse_bus.evse.model import (
+    ChargerReading,
+    ConnectorReading,
+    CurrentLimit,
+    OrderChange,
+    Orders,
+)
+from tests.evse.simulated import now, simulate
+from tests.virtual import Car
+from tests.virtual.ews_box import EwsBox as VirtualBox
+from tests.virtual.faults import Faults
+from tests.virtual.log import CLIENT
+from tests.virtual.wire import Segment
+
+BYTE = SETTINGS.byte_time
+STEP = 0.02
+SERIAL = "012345678901"
+
+
+class Outside:
+    """What a virtual box wants of its bus, in simulated time."""
+
+    def __init__(self, line: Ether) -> None:
+        self._line = line
+        self.faults = Faults()
+        self.rng = Random(1)  # noqa: S311 - repeatable on purpose
+        self.byte_time = BYTE
+
+    @property
+    def loop(self) -> asyncio.AbstractEventLoop:
+        return asyncio.get_running_loop()
+
+    def time(self) -> float:
+        return now()
+
+    def now(self) -> float:
+        return now()
+
+    def call[T](self, function: Callable[[], T]) -> T:
+        return function()
+
+    def send_at(self, _device: object, data: bytes, at: float) -> None:
+        loop = self.loop
+        if at <= loop.time():
+            self._line.say(data)
+        else:
+            loop.call_at(at, self._line.say, data)
+
+
+@dataclass(frozen=True)
+class Sent:
+    """A command on the wire."""
+
+    when: float
+    name: str
+    parameters: bytes
+
+
+class Ether(Line):
+    """A wire for each direction; what is not heard can be chosen."""
+
+    def __init__(self) -> None:
+        super().__init__("simulated", SETTINGS)
+        self.sent: list[Sent] = []
+        self.box: VirtualBox | None = None
+        self.deaf: Callable[[str], bool] = lambda _name: False
+        """The box does not hear a command."""
+        self.mute: Callable[[str], bool] = lambda _name: False
+        """Its answer is not heard."""
+        self.cut = False
+        """Nothing passes."""
+        self.lumps = 1
+        """Bytes that arrive at once."""
+        self._open = False
+        self._name = ""
+        self._free_at = 0.0
+
+    @property
+    @override
+    def is_open(self) -> bool:
+        return self._open
+
+    @override
+    async def open(self) -> None:
+        self._open = True
+        self.statistics.opened += 1
+
+    @override
+    async def close(self) -> None:
+        self._open = False
+
+    def unplug(self) -> None:
+        self._open = False
+        self.on_lost(LineLostError("unplugged"))
+
+    @override
+    def write(self, data: bytes, *, reply_may_equal: bool = False) -> float:
+        if not self._open:
+            raise LineLostError("not open")
+        name = data[4:6].decode()
+        self.sent.append(Sent(now(), name, data[6:-1]))
+        end = now() + len(data) * BYTE
+        if not self.deaf(name) and not self.cut:
+            asyncio.get_running_loop().call_at(end, self._heard, name, data)
+        return end
+
+    def _heard(self, name: str, data: bytes) -> None:
+        assert self.box is not None
+        self._name = name
+        end = now()
+        self.box.hear(Segment(end - len(data) * BYTE, BYTE, data, (CLIENT,), end))
+
+    def say(self, data: bytes) -> None:
+        """Let the box send bytes: one after the other."""
+        is_answer = data[3:4] == b"A"
+        if self.cut or (is_answer and self.mute(data[4:6].decode("latin-1"))):
+            return
+        loop = asyncio.get_running_loop()
+        begin = max(now(), self._free_at)
+        self._free_at = begin + len(data) * BYTE
+        size = self.lumps if self.lumps > 0 else len(data)
+        for at in range(0, len(data), size):
+            lump = data[at : at + size]
+            loop.call_at(begin + (at + len(lump)) * BYTE, self._arrive, lump)
+
+    def _arrive(self, data: bytes) -> None:
+        if self._open:
+            self.on_data(data)
+
+    def named(self, *names: str, since: float = 0.0) -> list[Sent]:
+        return [one for one in self.sent if one.name in names and one.when >= since]
+
+    def orders(self, order: int | None = None, since: float = 0.0) -> list[Sent]:
+        """Return what was sent as `sl`."""
+        return [
+            one
+            for one in self.named("sl", since=since)
+            if order in (None, one.parameters[1])
+        ]
+
+    def limits(self, port: int = 1, since: float = 0.0) -> list[int]:
+        return [
+            one.parameters[1]
+            for one in self.named("st", since=since)
+            if one.parameters[0] == port
+        ]
+
+
+@dataclass
+class EwsScene:
+    """One box, two cars, and the library."""
+
+    current: float = 16.0
+    allowed: bool | None = None
+    installation: float = 32.0
+    expected: str | None = SERIAL
+    ports: tuple[int, ...] = (1, 2)
+    lifetime: float | None = None
+    fail_safe: float = 6.0
+    timing: Timing = PROTOCOL.timing
+    config: dict[str, Any] = field(default_factory=dict)
+    options: dict[str, Any] = field(default_factory=dict)
+    """Of the virtual box."""
+    line: Ether = field(init=False)
+    box: VirtualBox = field(init=False)
+    cars: tuple[Car, Car] = field(init=False)
+    events: list[Event] = field(default_factory=list)
+    seen: list[Callable[[], None]] = field(default_factory=list)
+    """Called at each step of the simulated time."""
+
+    def __post_init__(self) -> None:
+        self.line = Ether()
+        self.cars = (Car(max_current=32.0), Car(max_current=32.0))
+        self.bus = Bus(self.line, PROTOCOL.framer(), self.timing, "simulated")
+        for port in self.ports:
+            self.bus.add(self.make_charger(port))
+        self._life: asyncio.Task[None] | None = None
+        self.box = self.make_box()
+
+    def make_box(self, serial: str = SERIAL) -> VirtualBox:
+        box = VirtualBox(serial=serial, cars=self.cars, **self.options)
+        box.bus = Outside(self.line)  # type: ignore[assignment]
+        self.line.box = box
+        return box
+
+    def make_charger(self, port: int, key: str | None = None) -> EwsPort:
+        charger = PROTOCOL.charger(
+            EwsPortConfig(
+                key=key or f"port{port}",
+                name=f"port {port}",
+                address=port,
+                installation_limit=self.installation,
+                serial=self.expected,
+                order_lifetime=self.lifetime,
+                **self.config,
+            ),
+            Orders(
+                limit=CurrentLimit(current=self.current),
+                allowed=self.allowed,
+                fail_safe=CurrentLimit(current=self.fail_safe),
+            ),
+        )
+        assert isinstance(charger, EwsPort)
+        return charger
+
+    # -- What is to be seen --------------------------------------------------------
+
+    def charger(self, port: int = 1) -> EwsPort:
+        charger = self.bus.chargers[f"port{port}"]
+        assert isinstance(charger, EwsPort)
+        return charger
+
+    def reading(self, port: int = 1) -> ChargerReading:
+        reading = self.charger(port).reading
+        assert reading is not None
+        return reading
+
+    def connector(self, port: int = 1) -> ConnectorReading:
+        return self.reading(port).connectors[1]
+
+    def status(self, port: int = 1) -> int:
+        return self.box.ports[port - 1].status
+
+    def unlocked(self, port: int = 1) -> list[str]:
+        """Return why a port's lock has opened."""
+        return [one.reason for one in self.box.ports[port - 1].witness.unlockings]
+
+    def starts(self, port: int = 1) -> list[str]:
+        """Return what has started a port's charges."""
+        return [cause for _, cause in self.box.ports[port - 1].witness.starts]
+
+    # -- Time ----------------------------------------------------------------------
+
+    async def until(self, what: Callable[[], object], patience: float = 60.0) -> float:
+        """Wait for something; return how long it took."""
+        begin = now()
+        while not what():
+            assert now() - begin < patience, "it never happened"
+            await asyncio.sleep(STEP)
+        return now() - begin
+
+    async def settled(self) -> None:
+        """Wait until all is known, and nothing more is to be said."""
+        await self.until(
+            lambda: all(
+                one.reading is not None
+                and not one._conversations
+                and not one.limiter.must_assert()
+                for one in map(self.charger, self.ports)
+            )
+        )
+
+    async def plug(self, port: int = 1) -> None:
+        """Let a car come, and wait until it is seen waiting."""
+        self.cars[port - 1].plug_in()
+        await self.until(lambda: self.connector(port).raw_state == "0x30")
+
+    async def charge(self, port: int = 1) -> None:
+        """Let a car come and charge, on the user's word."""
+        await self.plug(port)
+        await self.charger(port).change_orders(OrderChange(allowed=True))
+        await self.until(lambda: self.status(port) == 0x40)
+        await asyncio.sleep(2.5)
+
+    async def _live(self) -> None:
+        while True:
+            self.box.step()
+            for look in self.seen:
+                look()
+            await asyncio.sleep(STEP)
+
+    async def __aenter__(self) -> Self:
+        self._life = asyncio.create_task(self._live())
+        await self.bus.start()
+        self.charger(self.ports[0]).box.events.subscribe(self.events.append)
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.bus.stop()
+        if self._life is not None:
+            self._life.cancel()
+            with suppress(asyncio.CancelledError):
+                await self._life
+
+
+def play(scene: EwsScene, acts: Callable[[EwsScene], object]) -> EwsScene:
+    """Run what happens in simulated time, once everything is known."""
+
+    async def run() -> None:
+        async with scene:
+            await scene.settled()
+            await acts(scene)  # type: ignore[misc]
+
+    simulate(run())
+    return scene
+
+
+def quick(scene: EwsScene, **changes: float) -> EwsScene:
+    """Return a scene whose bus has other times."""
+    return replace(scene, timing=replace(scene.timing, **changes))  # type: ignore[arg-type]
