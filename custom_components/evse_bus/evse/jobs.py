@@ -28,7 +28,8 @@ class Later[T]:
     """s"""
     step: Step[T]
     worst_case: float | None = None
-    """Longest time its next turn can take, s; ``None``: as any turn of its charger."""
+    """Longest time its next turn can take, s; ``None``: as the turn before it, or as any
+    turn of its charger."""
 
 
 @dataclass(slots=True, eq=False, kw_only=True)

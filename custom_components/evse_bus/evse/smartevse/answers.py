@@ -13,6 +13,7 @@ from ..errors import ExchangeError, LineBusyError, NotAvailableError
 from ..exchange import Talk
 from ..jobs import Later
 from .balancing import RequestKind, SlaveRequest
+from .registers import LONGEST_REQUEST
 
 if TYPE_CHECKING:
     from .member import Member
@@ -21,7 +22,8 @@ if TYPE_CHECKING:
 ANSWER_WITHIN: Final = 0.8
 """Later than this a request is not answered, s: after 1 s the box has given it up, and
 would close its contactor on a late word all the same. It asks again."""
-ANSWER_BYTES: Final = 8
+ANSWER_BYTES: Final = LONGEST_REQUEST
+"""A broadcast may go in its place."""
 ROUNDS: Final = 2
 """How often the others are asked to make room for one request."""
 
@@ -46,7 +48,7 @@ class Answer:
         try:
             if self._others_can_make_room():
                 await self._slave.master.speak(talk)
-                return Later(0.0, self._look)
+                return self._look_next()
             await talk.send(partial(self._slave.answer_frame, self._request))
         except LineBusyError:
             return self._go_on()
@@ -74,7 +76,12 @@ class Answer:
         other = self._others.pop()
         with suppress(ExchangeError, LineBusyError, NotAvailableError):
             await other.look(talk)
-        return Later(0.0, self._look) if self._others else self._go_on()
+        return self._look_next() if self._others else self._go_on()
+
+    def _look_next(self) -> Later[None]:
+        other = self._others[-1]
+        worst = other.bus.worst_case(other) if other.bus is not None else None
+        return Later(0.0, self._look, worst)
 
     def _go_on(self) -> Later[None]:
         bus = self._slave.bus

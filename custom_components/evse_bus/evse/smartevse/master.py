@@ -49,7 +49,8 @@ LOOKING: Final = 1.5
 OTHERS: Final = 60.0
 """How long we stay silent after the last word of another master, s."""
 ECHO: Final = 0.5
-"""Our own broadcast, heard again within this time, is no other master's, s."""
+"""Our own broadcast, heard again within this time, is no other master's, s. A network
+port may hand it on when another one has gone out already."""
 LIVE_ON: Final = 8.0
 """After a shorter silence of ours the slaves still charge: no time to lose, s."""
 RETRY: Final = 0.5
@@ -77,6 +78,8 @@ class Master(Duty):
     def __init__(self, supply: Supply) -> None:
         """Raise RefusedOrderError for a supply that cannot be."""
         super().__init__()
+        # Before all that waits: it is short, and late it has no deadline to defend it.
+        self.slot.due = -inf
         self._supply = checked(supply)
         self._phase = _Phase.LISTENING
         self._planned = 0.0
@@ -84,7 +87,9 @@ class Master(Duty):
         self._draws: dict[int, Draw] = {}
         self._looked_at: set[int] = set()
         self._sent: tuple[int, ...] = ()
-        self._last: tuple[float, bytes] = (-inf, b"")
+        self._spoke_at = -inf
+        self._spoken: list[tuple[float, bytes]] = []
+        """Our broadcasts whose echo may still come."""
         self._is_planned = False
         self._has_spoken = asyncio.Event()
 
@@ -133,7 +138,7 @@ class Master(Duty):
         if unit not in self._draws:
             draw = self._draws[unit] = Draw(self._unknown_until)
             # It was nobody's word so far, and heard so.
-            draw.said(0, self._last[0])
+            draw.said(0, self._spoke_at)
         return self._draws[unit]
 
     def _all_draws(self) -> dict[int, Draw]:
@@ -228,7 +233,7 @@ class Master(Duty):
             self._speak_now()
 
     def _speak_now(self) -> None:
-        self.slot.ready = self.slot.due = min(self.slot.ready, self.now)
+        self.slot.ready = min(self.slot.ready, self.now)
         if self.bus is not None:
             self.bus.look_again()
 
@@ -256,7 +261,9 @@ class Master(Duty):
         for unit, draw in self._draws.items():
             draw.said(self._sent[unit - 1], now)
         raw = broadcast(words)
-        self._last = (now, raw)
+        self._spoke_at = now
+        self._spoken = [one for one in self._spoken if now - one[0] <= ECHO]
+        self._spoken.append((now, raw))
         self._has_spoken.set()
         return raw
 
@@ -299,13 +306,13 @@ class Master(Duty):
         self._plan(self._planned, self._planned)
 
     def _plan(self, ready: float, planned: float) -> None:
-        self.slot.ready = self.slot.due = ready
+        self.slot.ready = ready
         self.slot.start_by = planned + SLACK
         if self.bus is not None:
             self.slot.worst_case = self.bus.wire.send_time(LONGEST_REQUEST)
 
     def _wait(self, until: float) -> None:
-        self.slot.ready = self.slot.due = until
+        self.slot.ready = until
         self.slot.start_by = inf
 
     @override
@@ -339,8 +346,7 @@ class Master(Duty):
     def on_line_open(self, now: float) -> None:
         if self._phase is _Phase.HUSHED and self.slot.ready > now:
             return
-        spoke, _ = self._last
-        if now - spoke < LIVE_ON:
+        if now - self._spoke_at < LIVE_ON:
             # The slaves still charge by our word: they hear it again soon.
             self._look(now)
             return
@@ -367,14 +373,16 @@ class Master(Duty):
             return False
         now = self.now
         if is_foreign_broadcast(frame):
-            spoke, raw = self._last
-            if frame.raw != raw or now - spoke > ECHO:
+            if not any(
+                raw == frame.raw and now - when <= ECHO for when, raw in self._spoken
+            ):
                 self._hush(now)
             return True
         request = decode_request(frame)
         if request is not None and request.unit in self._draws:
             self._draws[request.unit].asked(now)
-        return False
+        # While we are silent it is nobody's here: no turn would ever come.
+        return request is not None and self.silent
 
     def _hush(self, now: float) -> None:
         """Another master speaks: let nobody on this bus speak beside it."""

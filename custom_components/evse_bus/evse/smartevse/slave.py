@@ -22,7 +22,7 @@ from .answers import ANSWER_BYTES, ANSWER_WITHIN, Answer
 from .balancing import RequestKind, SlaveRequest, acknowledge, decode_request
 from .dialects import Dialect
 from .member import Member
-from .registers import tenths
+from .registers import Status, tenths
 from .states import is_stopped
 from .timing import LOOK_AGAIN
 
@@ -57,12 +57,9 @@ class SlaveSmartEvse(Member):
         """
         if self.status is None:
             return None
-        off = self.wanted.paused or self.withheld
-        if off and not is_stopped(self.known_dialect, self.status):
-            return False
-        if not off and not self.status.access and self._is_ours:
-            return True
-        return None
+        if not is_stopped(self.known_dialect, self.status):
+            return False if self._must_be_off() else None
+        return True if self._is_ours and self.may_begin() else None
 
     async def _turn(self, talk: Talk, allowed: bool) -> Turns:  # noqa: FBT001
         """Set the access bit, and remember whether that was our own doing."""
@@ -70,9 +67,25 @@ class SlaveSmartEvse(Member):
             had_access = self.status is None or self.status.access
             own = self._standing.allowed is not False
             self._is_ours = own and (had_access or self._is_ours)
-        async for pause in self.set_access(talk, allowed):
+        still = self._may_be_on if allowed else self._must_be_off
+        async for pause in self.set_access(talk, allowed, still):
             yield pause
         if allowed:
+            self._is_ours = False
+
+    def _may_be_on(self) -> bool:
+        return not self.wanted.paused
+
+    def _must_be_off(self) -> bool:
+        # Somebody's no at the box counts, too: an answer of ours that crossed it on
+        # the line has closed the contactor all the same.
+        return not self.may_begin() or self._is_refused
+
+    @override
+    def take(self, status: Status, now: float) -> None:
+        super().take(status, now)
+        if status.access and self.may_begin():
+            # It is open already: nothing is left to give back.
             self._is_ours = False
 
     # -- Orders --------------------------------------------------------------------
@@ -147,6 +160,11 @@ class SlaveSmartEvse(Member):
             return Later(0.0, _nothing, 0.0)
         if request.kind in (RequestKind.B, RequestKind.C):
             self._own_maximum = request.wanted
+            if self.may_begin() and self._is_refused:
+                # Opened at the box since, or closed since it asked: to be read first.
+                # It asks again in a second.
+                self._tend_soon(now)
+                return Later(0.0, _nothing, 0.0)
         else:
             # What it leaves the others need not wait for.
             self._promised_until = -inf
@@ -166,8 +184,13 @@ class SlaveSmartEvse(Member):
         self._promised_until = until
 
     def may_begin(self) -> bool:
-        """Return whether its requests for current may be granted at all."""
-        return not self.wanted.paused and not self.withheld and not self._is_ours
+        """Return whether it may charge, for all that we have to say."""
+        return not self.wanted.paused and not self.withheld
+
+    @property
+    def _is_refused(self) -> bool:
+        """Return whether its access was off when it was read last."""
+        return self.status is not None and not self.status.access
 
     def answer_frame(self, request: SlaveRequest) -> bytes:
         """Return the answer of this moment, which must be sent now.
