@@ -2,6 +2,7 @@
 
 import asyncio
 from contextlib import suppress
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -282,3 +283,22 @@ def test_a_start_half_done_does_not_outlive_the_farewell(dialect: Dialect) -> No
         assert not scene.outlet.access
 
     play(PolledScene(dialect, stop_on_shutdown=True), acts)
+
+
+@each
+def test_a_limit_that_no_order_took_away_comes_back(dialect: Dialect) -> None:
+    async def acts(scene: PolledScene) -> None:
+        await scene.charge()
+        await scene.polled(3)
+        config = scene.charger.config
+        scene.charger.set_up(replace(config, installation_limit=5.0))
+        await scene.until(lambda: scene.box.offers == 0, 20)
+        await scene.polled(2)
+        scene.charger.set_up(config)
+        await scene.until(lambda: scene.box.offers == 10, 40)
+        # A no at the box is another matter.
+        scene.box.controller.outlet.set_access(False)
+        await scene.polled(3)
+        assert not scene.outlet.access
+
+    play(PolledScene(dialect), acts)

@@ -39,6 +39,7 @@ from .registers import Status, tenths, write_current
 from .states import CHARGING, is_stopped, offered, state_of, tells_plug
 from .timing import LOOK_AGAIN, SETTLING
 
+_NOTHING_NEW: Final = OrderChange()
 _LOWEST: Final = Orders(limit=CurrentLimit(current=MINIMUM_CURRENT))
 
 
@@ -110,7 +111,12 @@ class PolledSmartEvse(PolledBox):
 
     @override
     def must_tend(self, now: float) -> bool:
-        return super().must_tend(now) or self._must_stop() or self._must_write()
+        return (
+            super().must_tend(now)
+            or self._must_stop()
+            or self._must_write()
+            or self._may_start(_NOTHING_NEW)
+        )
 
     @override
     async def tend(self, talk: Talk) -> Turns:
@@ -127,6 +133,10 @@ class PolledSmartEvse(PolledBox):
             yield pause
         if self._must_write():
             async for pause in self._follow(talk, lambda: self.setpoint):
+                yield pause
+        if self._may_start(_NOTHING_NEW):
+            # What took its current away was no order: installation, settings, time.
+            async for pause in self._allow(talk, _NOTHING_NEW):
                 yield pause
 
     async def _stop_if_need_be(self, talk: Talk) -> Turns:
@@ -363,16 +373,10 @@ class PolledSmartEvse(PolledBox):
         """
         if change.allowed is True:
             return True
-        asked = change.current is not None or any(
-            phase is not None for phase in change.phases
-        )
-        return (
-            asked
-            and self._limit_paused
-            and self.target(change).allowed is not False
-            and (self.status is None or not self.status.access)
-            and self._wanted(change).current >= (self._defied or 0.0)
-        )
+        if not self._limit_paused or self.status is None or self.status.access:
+            return False
+        wanted = self._wanted(change)
+        return not wanted.paused and wanted.current >= (self._defied or 0.0)
 
     # -- Commands --------------------------------------------------------------------
 
