@@ -1,5 +1,6 @@
 """Orders on disk: there before the port opens, a lowering before it is sent."""
 
+import asyncio
 from typing import Any
 from unittest.mock import patch
 
@@ -230,3 +231,30 @@ async def test_the_same_order_is_not_written_again(
     assert STORE in hass_storage
     await store.async_remove()
     assert STORE not in hass_storage
+
+
+async def test_a_lowering_is_written_also_when_its_action_is_given_up(
+    hass: HomeAssistant, hass_storage: dict[str, Any]
+) -> None:
+    hass_storage[STORE] = stored(14.0)
+    disk = asyncio.Event()
+    writing = asyncio.Event()
+    write = Store._async_write_data
+
+    async def slow(self: Store, data: dict[str, Any]) -> None:
+        writing.set()
+        await disk.wait()
+        await write(self, data)
+
+    store = OrderStore(hass, "bus")
+    await store.async_load()
+    lower = Orders(limit=CurrentLimit(current=8.0))
+    with patch.object(Store, "_async_write_data", slow):
+        commit = asyncio.create_task(store.async_commit(ABL, lower))
+        await writing.wait()
+        commit.cancel()
+        await asyncio.wait({commit})
+        assert commit.cancelled()
+        disk.set()
+        await hass.async_block_till_done()
+    assert hass_storage[STORE]["data"][ABL]["limit"]["current"] == 8.0

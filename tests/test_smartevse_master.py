@@ -1,11 +1,14 @@
 """Home Assistant as the master of SmartEVSE slaves: one supply, one master."""
 
+import asyncio
 from typing import Any
+from unittest.mock import patch
 
 from homeassistant.const import EVENT_HOMEASSISTANT_STOP
 from homeassistant.core import HomeAssistant
 from homeassistant.exceptions import ServiceValidationError
 from homeassistant.helpers import entity_registry as er
+from homeassistant.helpers.storage import Store
 import pytest
 from pytest_homeassistant_custom_component.common import MockConfigEntry
 
@@ -145,6 +148,37 @@ async def test_a_lost_supply_is_told(
         assert issue(hass, "supply_lost_bus")
         await call(hass, "number.set_value", supply, value=20)
         assert not issue(hass, "supply_lost_bus")
+
+
+async def test_an_order_that_nobody_waits_for_any_more_counts(
+    hass: HomeAssistant, hass_storage: dict[str, Any]
+) -> None:
+    """An automation that begins anew cancels what it waits for: here, the disk."""
+    disk = asyncio.Event()
+    writing = asyncio.Event()
+    write = Store._async_write_data
+
+    async def slow(self: Store, data: dict[str, Any]) -> None:
+        writing.set()
+        await disk.wait()
+        await write(self, data)
+
+    boxes = slaves()
+    async with running(hass, *boxes, supply=SUPPLY) as (entry, bus):
+        await both_charge(hass, entry, boxes)
+        await entry.runtime_data.orders.async_flush()
+        supply = bus_entity(hass, "number", "shared_supply")
+        with patch.object(Store, "_async_write_data", slow):
+            action = asyncio.create_task(
+                call(hass, "number.set_value", supply, value=13.0)
+            )
+            await writing.wait()
+            action.cancel()
+            await asyncio.wait({action})
+            disk.set()
+            await bus.wait_for_async(lambda: broadcasts(bus)[-1] == (0, 65, 65, 0))
+        assert state_of(hass, supply) == "13.0"
+        assert hass_storage[STORE]["data"]["bus"] == {"supply": 13.0}
 
 
 async def test_a_smaller_installation_counts_at_once(hass: HomeAssistant) -> None:

@@ -22,6 +22,7 @@ from .devices import BusDevices, connector_key
 from .evse.listeners import tell
 from .evse.model import Orders, Supply
 from .farewell import async_say_farewell
+from .finish import async_finish
 from .issues import BusIssues
 from .orders import OrderStore
 from .setup import (
@@ -130,7 +131,9 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
     async def async_order_supply(self, value: float) -> None:
         """Let the chargers share this much, A a phase; raises RefusedOrderError."""
         if self.supply is not None:
-            await self.supply.async_order(value)
+            # What is on disk must count, also where nobody waits for it any more.
+            order = self.supply.async_order(value)
+            await async_finish(self.hass, order, "evse_bus shared supply")
             self.issues.supply_renewed()
 
     async def _async_share(self, supply: Supply) -> None:

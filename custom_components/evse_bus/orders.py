@@ -20,6 +20,7 @@ from .const import DOMAIN, LOGGER
 from .evse.errors import RefusedOrderError
 from .evse.model import CurrentLimit, Orders, Phases
 from .evse.safety import cautious, number
+from .finish import async_finish
 
 STORAGE_VERSION: Final = 1
 RAISE_DELAY: Final = 1.0
@@ -48,6 +49,7 @@ class OrderStore:
         on_write: Callable[[Exception | None], None] = lambda _error: None,
     ) -> None:
         """Read nothing yet; ``on_write`` is told how each write went."""
+        self._hass = hass
         self._store = _WatchedStore(hass, entry_id, on_write)
         self._bus_key = entry_id
         self._orders: dict[str, Orders] = {}
@@ -123,7 +125,8 @@ class OrderStore:
     async def async_flush(self) -> None:
         """Write now what has not been written."""
         self._pending = False
-        await self._store.async_save(self._encoded())
+        write = self._store.async_save(self._encoded())
+        await async_finish(self._hass, write, "evse_bus orders")
 
     async def async_close(self) -> None:
         """Leave nothing unwritten and no timer behind."""
