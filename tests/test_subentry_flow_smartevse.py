@@ -185,6 +185,22 @@ async def test_no_second_box_on_a_bus_that_polls(hass: HomeAssistant) -> None:
     assert get(entry, "Other").data["stop_on_shutdown"] is True
 
 
+async def test_two_dialogues_add_one_box_to_a_bus_that_polls(
+    hass: HomeAssistant,
+) -> None:
+    entry = await setup_bus(hass, "smartevse", NOWHERE)
+    dialogues = [await Flow.add_charger(hass, entry) for _ in range(2)]
+    for unit, flow in enumerate(dialogues):
+        await flow.submit({"unit": str(unit)})
+        await flow.submit(charger(f"Box {unit}") | {"stop_on_shutdown": True})
+        assert flow.step == "confirm_smartevse"
+    for flow in dialogues:
+        await flow.submit()
+    assert dialogues[0].result["type"] is FlowResultType.CREATE_ENTRY
+    assert dialogues[1].result["reason"] == "one_box"
+    assert [one.title for one in entry.subentries.values()] == ["Box 0"]
+
+
 async def test_box_is_searched_on_a_bus_that_has_lost_its_own(
     hass: HomeAssistant,
 ) -> None:

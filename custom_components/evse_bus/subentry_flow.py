@@ -65,7 +65,7 @@ class ChargerSubentryFlow(
         entry = self._get_entry()
         self.protocol = protocol_of(entry.data)
         self.bus_data = dict(entry.data)
-        if ADDRESSES[self.protocol.key].alone and self.others():
+        if self._is_full():
             return self.async_abort(reason="one_box")
         # A search that sets limits is left to the charger's own first turn; and
         # the address that every box answers to is not for a bus with others on it.
@@ -77,6 +77,10 @@ class ChargerSubentryFlow(
             menu_options=list(self.choices()),
             description_placeholders=self.placeholders(),
         )
+
+    def _is_full(self) -> bool:
+        """Return whether no further charger can be on this bus."""
+        return ADDRESSES[self.protocol.key].alone and bool(self.others())
 
     @override
     async def async_scan(self, progress: Progress) -> ScanReport:
@@ -93,6 +97,8 @@ class ChargerSubentryFlow(
         """Create the charger."""
         [charger] = chargers
         # Another dialogue may have been quicker.
+        if self._is_full():
+            return self.async_abort(reason="one_box")
         if charger["data"][CONF_ADDRESS] in self.taken():
             return self.async_abort(reason="already_configured")
         return self.async_create_entry(
