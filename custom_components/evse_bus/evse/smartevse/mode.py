@@ -65,7 +65,7 @@ def _check_changeable(box: SmartEvseBox) -> None:
     if box.configuration.load_balancing == 0:
         message = (
             f"{name} changes its mode on request only as a load-balancing master: set "
-            "LOADBL to Master in its menu, or change MODE there"
+            "LOAD BAL to Master in its menu, or change MODE there"
         )
         raise NotAvailableError(message)
     if _mode_of(box) is Mode.NORMAL:
