@@ -15,6 +15,7 @@ from typing import Final, override
 from ..errors import (
     NotConfirmedError,
     RefusedOrderError,
+    SupersededError,
 )
 from ..exchange import Talk
 from ..jobs import Later
@@ -234,13 +235,15 @@ class PolledSmartEvse(PolledBox):
     async def _give_up(self, talk: Talk, *, judged: bool) -> Turns:
         """Stop a box that does not follow; ``judged``: it had its time.
 
-        Raises NotConfirmedError, always.
+        Raises NotConfirmedError, or SupersededError where a newer order came.
         """
         status = self.status
-        if status is None or not judged:
-            # A newer order has not had its time yet.
-            message = f"{self.config.name} has not followed its limit yet"
+        if status is None:
+            message = f"{self.config.name} has not told whether it follows its limit"
             raise NotConfirmedError(message)
+        if not judged:
+            message = "a newer limit came first"
+            raise SupersededError(message)
         offers = offered(self.known_dialect, status)
         async for pause in self._stop(talk, ours=True):
             yield pause
