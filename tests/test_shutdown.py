@@ -1,10 +1,11 @@
 """What a polled SmartEVSE is told when Home Assistant stops: only what was chosen."""
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable
 from typing import Any
 
-from homeassistant.const import EVENT_HOMEASSISTANT_STOP
+from homeassistant.config_entries import ConfigEntries, ConfigEntry
+from homeassistant.const import EVENT_HOMEASSISTANT_STOP, Platform
 from homeassistant.core import HomeAssistant
 import pytest
 
@@ -81,6 +82,25 @@ async def test_without_the_option_it_goes_on(hass: HomeAssistant) -> None:
         await stop(hass)
         assert box.contactor
         assert not access_writes(box)
+
+
+async def test_a_stop_right_at_the_start(
+    hass: HomeAssistant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The box is spoken to already, and its entities are not there yet."""
+    forward = ConfigEntries.async_forward_entry_setups
+
+    async def stopped_meanwhile(
+        self: ConfigEntries, entry: ConfigEntry, platforms: Iterable[Platform]
+    ) -> None:
+        await stop(hass)
+        await forward(self, entry, platforms)
+
+    monkeypatch.setattr(ConfigEntries, "async_forward_entry_setups", stopped_meanwhile)
+    box = SmartEvse(car=car())
+    async with running(hass, box, stop_on_shutdown=True) as (_, bus):
+        assert not box.access
+        await bus.wait_for_async(lambda: not bus.connected)
 
 
 async def test_a_reload_stops_nothing(hass: HomeAssistant) -> None:

@@ -43,6 +43,10 @@ async def async_setup_entry(hass: HomeAssistant, entry: EvseBusConfigEntry) -> b
     """Set up a bus and the chargers on it."""
     # There from the beginning, so that diagnostics can tell of a bus that fails.
     entry.runtime_data = coordinator = BusCoordinator(hass, entry)
+    # Before a charger is spoken to: it is told also when the stop comes right then.
+    entry.async_on_unload(
+        hass.bus.async_listen_once(EVENT_HOMEASSISTANT_STOP, coordinator.async_shutdown)
+    )
     try:
         await coordinator.async_start()
         await hass.config_entries.async_forward_entry_setups(entry, PLATFORMS)
@@ -54,9 +58,6 @@ async def async_setup_entry(hass: HomeAssistant, entry: EvseBusConfigEntry) -> b
         await coordinator.async_stop()
         raise
     entry.async_on_unload(entry.add_update_listener(_async_updated))
-    entry.async_on_unload(
-        hass.bus.async_listen_once(EVENT_HOMEASSISTANT_STOP, coordinator.async_shutdown)
-    )
     return True
 
 
