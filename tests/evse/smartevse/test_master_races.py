@@ -10,7 +10,12 @@ import pytest
 from custom_components.evse_bus.evse.errors import EvseError
 from custom_components.evse_bus.evse.exchange import Talk
 from custom_components.evse_bus.evse.jobs import Later
-from custom_components.evse_bus.evse.model import OrderChange, Persistence, Supply
+from custom_components.evse_bus.evse.model import (
+    Fault,
+    OrderChange,
+    Persistence,
+    Supply,
+)
 from custom_components.evse_bus.evse.smartevse.master import ECHO, PERIOD
 from tests.evse.simulated import SimulatedLoop, now, simulate
 from tests.evse.smartevse.ether import MasterScene
@@ -148,6 +153,21 @@ def test_a_no_at_the_box_that_crosses_our_answer_counts(waits: str) -> None:
     simulate(scene())
 
 
+def test_a_request_from_before_a_no_at_the_box_is_not_granted() -> None:
+    async def scene() -> None:
+        async with MasterScene(units=(2,)) as scene:
+            await asyncio.sleep(5)
+            scene.box(2).controller.outlet.set_access(False)
+            await asyncio.sleep(3)
+            asked = now()
+            scene.line.say(ASKS)
+            await asyncio.sleep(3)
+            assert answers(scene, asked) == []
+            assert scene.most == 0
+
+    simulate(scene())
+
+
 def test_a_yes_at_the_box_costs_a_second_and_not_a_minute() -> None:
     async def scene() -> None:
         async with MasterScene(units=(2,)) as scene:
@@ -181,6 +201,28 @@ def test_nothing_is_granted_to_a_box_that_was_stopped_for_want_of_supply() -> No
             for answer in answers(scene, asked):
                 assert answer.data[4:6] == b"\x00\x00", answer
             assert scene.offers == 0
+
+    simulate(scene())
+
+
+def test_a_box_that_does_not_stop_is_told_of() -> None:
+    """Nobody has ordered it: it is the supply that does not suffice."""
+
+    async def scene() -> None:
+        async with MasterScene(units=(2,), watch=False) as scene:
+            await asyncio.sleep(5)
+            await scene.charge(2)
+            await asyncio.sleep(3)
+            assert Fault.LIMIT_NOT_TAKEN not in scene.slave(2).faults
+            scene.box(2).controller.ignore_access = True
+            await scene.master.change_supply(Supply(limit=5.0))
+            await asyncio.sleep(6)
+            assert scene.offers == 6
+            assert Fault.LIMIT_NOT_TAKEN in scene.slave(2).faults
+            scene.box(2).controller.ignore_access = False
+            await asyncio.sleep(6)
+            assert scene.offers == 0
+            assert Fault.LIMIT_NOT_TAKEN not in scene.slave(2).faults
 
     simulate(scene())
 

@@ -246,9 +246,9 @@ class Member(SmartEvseBox):
 
     def _see_whether_it_follows(self, status: Status, *, closed: bool) -> None:
         """Say again at once what it has not heard; more than once is a fault."""
-        if not closed or not LOWEST <= round(self.share * 10) < round(
-            status.current * 10
-        ):
+        share = round(self.share * 10)
+        # Without a share it is to be stopped, whatever it offers.
+        if not closed or LOWEST <= share >= round(status.current * 10):
             self._over = 0
             self.tell(Fault.LIMIT_NOT_TAKEN, present=False)
             return
