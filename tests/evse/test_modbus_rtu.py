@@ -252,3 +252,18 @@ def test_pymodbus_does_not_understand_the_malformed_exception() -> None:
     """Why finding frames is ours: it waits for more than will ever come."""
     assert _pymodbus(PERHAPS, server=False) is None
     assert [frame.raw for frame in feed(PERHAPS)[0]] == [PERHAPS]
+
+
+def test_a_refusal_in_the_midst_of_an_answer_is_none() -> None:
+    """Too hot, 11.5 A: ``00 04 00 73 00`` has a good checksum of its own."""
+    words = (8, 4, 115, 2, 0, 0, 0, 13, 3, 0, 303, 3870)
+    data = b"".join(word.to_bytes(2, "big") for word in words)
+    raw = rtu_frame(1, bytes((4, len(data))) + data)
+    assert bytes.fromhex("0004007300") in raw
+    framer = RtuFramer()
+    found = [
+        frame.raw
+        for index in range(len(raw))
+        for frame in framer.feed(raw[index : index + 1])
+    ]
+    assert found == [raw]

@@ -251,6 +251,9 @@ class RtuFramer(Framer[ModbusFrame]):
         while position < len(buffer):
             lengths = _rtu_lengths(buffer, position)
             frame = _rtu_decode(buffer, position, lengths)
+            if begun is not None and frame is not None and _is_weak(frame):
+                # Such bytes are found in the midst of a longer one that still comes.
+                frame = None
             if frame is not None:
                 self._lose(buffer[taken:position])
                 frames.append(frame)
@@ -269,6 +272,11 @@ class RtuFramer(Framer[ModbusFrame]):
         """Count bytes that no frame could be made of."""
         self.noise += len(data)
         self.bad += len(data) >= _RTU_EXCEPTION
+
+
+def _is_weak(frame: ModbusFrame) -> bool:
+    """Return whether little but the checksum says that this is a frame."""
+    return len(frame.raw) == _RTU_EXCEPTION and not frame.function & EXCEPTION
 
 
 def _rtu_lengths(buffer: bytes, start: int) -> tuple[int, ...]:
