@@ -277,3 +277,26 @@ async def test_another_device_answers(hass: HomeAssistant) -> None:
         box.controller.dialect = dialect
         await wait_for_state(hass, problem, "off")
         assert not issue(hass, "unknown_firmware_smartevse0")
+
+
+async def test_at_address_0_others_would_hear_what_it_is_told(
+    hass: HomeAssistant,
+) -> None:
+    box, other = SmartEvse(), SmartEvse("2.20")
+    async with running(hass, box, other) as (entry, _):
+        problem = await get_entity(hass, "binary_sensor", entry, "problem")
+        await wait_for_state(hass, problem, "on")
+        assert issue(hass, "shared_address_smartevse0")
+        assert not issue(hass, "duplicate_address_smartevse0")
+        allowed = await get_entity(hass, "switch", entry, "charging_allowed")
+        with pytest.raises(HomeAssistantError) as refused:
+            await call(hass, "switch.turn_off", allowed)
+        assert refused.value.translation_key == "shared_address"
+        assert not box.writes
+        # Alone again, it can be told.
+        hass.config_entries.async_remove_subentry(entry, f"smartevse{other.unit}")
+        await wait_for_state(hass, problem, "off")
+        assert not issue(hass, "shared_address_smartevse0")
+        assert not issue(hass, "duplicate_address_smartevse0")
+        await call(hass, "switch.turn_off", allowed)
+        assert not box.access

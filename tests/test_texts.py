@@ -16,14 +16,16 @@ from custom_components.evse_bus import (
 )
 from custom_components.evse_bus.errors import _COMMAND_KEYS, _PORT_KEYS
 from custom_components.evse_bus.issues import (
-    _FAULT_KEYS,
+    DUPLICATE_ADDRESS,
     LOST,
     NOT_STORED,
     SECOND_MASTER,
+    SHARED_ADDRESS,
     SUPPLY_LOST,
     TIMEOUT_RAISED,
     UNKNOWN_FIRMWARE,
     UNSUPPORTED_FIRMWARE,
+    WRONG_CHARGER,
 )
 from tests.flow import english
 
@@ -99,12 +101,14 @@ def test_errors_have_texts() -> None:
 
 def test_issues_have_texts() -> None:
     assert english()["issues"].keys() == {
-        *_FAULT_KEYS.values(),
+        DUPLICATE_ADDRESS,
         LOST,
         NOT_STORED,
         SECOND_MASTER,
+        SHARED_ADDRESS,
         SUPPLY_LOST,
         TIMEOUT_RAISED,
         UNKNOWN_FIRMWARE,
         UNSUPPORTED_FIRMWARE,
+        WRONG_CHARGER,
     }

@@ -28,6 +28,7 @@ from .evse.errors import (
     PortSettingsError,
     RefusedOrderError,
     ReplyTimeoutError,
+    SharedAddressError,
     SupersededError,
     WrongChargerError,
 )
@@ -45,6 +46,7 @@ _COMMAND_KEYS: Final[tuple[tuple[type[EvseError], str], ...]] = (
     (RefusedOrderError, "order_refused"),
     (SupersededError, "superseded"),
     (WrongChargerError, "wrong_charger"),
+    (SharedAddressError, "shared_address"),
     (DuplicateAddressError, "duplicate_address"),
     (NotConfirmedError, "not_confirmed"),
     (ExchangeRefusedError, "charger_refused"),

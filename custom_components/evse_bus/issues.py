@@ -9,7 +9,7 @@ from .evse.model import Fault, Orders
 from .evse.safety import INTERVALS_PER_TIMEOUT
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Set as AbstractSet
+    from collections.abc import Set as AbstractSet
 
     from homeassistant.config_entries import ConfigEntry
     from homeassistant.core import HomeAssistant
@@ -22,10 +22,9 @@ SUPPLY_LOST: Final = "supply_lost"
 TIMEOUT_RAISED: Final = "timeout_raised"
 SECOND_MASTER: Final = "second_master"
 
-_FAULT_KEYS: Final[Mapping[Fault, str]] = {
-    Fault.WRONG_CHARGER: "wrong_charger",
-    Fault.DUPLICATE_ADDRESS: "duplicate_address",
-}
+WRONG_CHARGER: Final = "wrong_charger"
+DUPLICATE_ADDRESS: Final = "duplicate_address"
+SHARED_ADDRESS: Final = "shared_address"
 UNKNOWN_FIRMWARE: Final = "unknown_firmware"
 UNSUPPORTED_FIRMWARE: Final = "unsupported_firmware"
 
@@ -88,16 +87,19 @@ class BusIssues:
 
     def check(self, unit: ChargerUnit) -> None:
         """Note what a charger told, or what was noticed of it."""
-        faults = unit.charger.faults
-        config = unit.charger.config
-        for fault, key in _FAULT_KEYS.items():
-            if fault not in faults:
-                self._set(key, unit.subentry_id, present=False)
-                continue
+        charger = unit.charger
+        config = charger.config
+        twice = Fault.DUPLICATE_ADDRESS in charger.faults
+        noticed = {
+            WRONG_CHARGER: Fault.WRONG_CHARGER in charger.faults,
+            DUPLICATE_ADDRESS: twice and not charger.shares_address,
+            SHARED_ADDRESS: twice and charger.shares_address,
+        }
+        for key, present in noticed.items():
             self._set(
                 key,
                 unit.subentry_id,
-                present=True,
+                present=present,
                 placeholders={
                     "charger": unit.name,
                     "address": str(config.address),

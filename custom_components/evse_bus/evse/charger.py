@@ -118,6 +118,11 @@ class Charger(ABC):
         return False
 
     @property
+    def shares_address(self) -> bool:
+        """Return whether others on its bus hear what is said to it, by their nature."""
+        return False
+
+    @property
     def told(self) -> tuple[object, ...]:
         """Return all that listeners may care about, to see whether it changed."""
         return (

@@ -75,6 +75,10 @@ class DuplicateAddressError(EvseError):
     """Two chargers answer at one address; nothing was written."""
 
 
+class SharedAddressError(DuplicateAddressError):
+    """Others on the bus hear what is said to this charger; nothing was written."""
+
+
 class NotConfirmedError(EvseError):
     """A command was sent and the charger never confirmed it."""
 

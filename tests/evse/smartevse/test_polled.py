@@ -5,10 +5,10 @@ import asyncio
 import pytest
 
 from custom_components.evse_bus.evse.errors import (
-    DuplicateAddressError,
     EvseError,
     NotConfirmedError,
     RefusedOrderError,
+    SharedAddressError,
     SupersededError,
 )
 from custom_components.evse_bus.evse.model import (
@@ -371,7 +371,7 @@ def test_at_address_0_nobody_else_may_be_there() -> None:
     async def acts(scene: PolledScene) -> None:
         since = now()
         scene.bus.add(PolledScene(LATER).make_charger("other"))
-        with pytest.raises(DuplicateAddressError):
+        with pytest.raises(SharedAddressError):
             await scene.charger.change_orders(OrderChange(allowed=False))
         assert scene.writes(since=since) == []
         assert Fault.DUPLICATE_ADDRESS in scene.charger.faults

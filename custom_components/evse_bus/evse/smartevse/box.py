@@ -64,11 +64,6 @@ class SmartEvseBox(SmartEvseReader):
         self.tell(Fault.DUPLICATE_ADDRESS, present=self.shares_address)
         return later or self.what_now(talk.now)
 
-    @property
-    def shares_address(self) -> bool:
-        """Return whether others on its bus hear what is said to it."""
-        return False
-
     def turns(self, conversation: Callable[[Talk], Turns]) -> Step[None]:
         """Return the first turn of a conversation with this box."""
         return in_turns(conversation)

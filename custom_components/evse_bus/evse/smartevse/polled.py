@@ -11,7 +11,7 @@ from dataclasses import replace
 from functools import partial
 from typing import ClassVar, Final, override
 
-from ..errors import DuplicateAddressError, LineBusyError
+from ..errors import LineBusyError, SharedAddressError
 from ..exchange import Request, Talk
 from ..jobs import Later, Step
 from ..model import ChargerConfig, Fault, Orders, Persistence
@@ -95,7 +95,7 @@ class PolledBox(SmartEvseBox):
         return self.config.address == 0 and others
 
     def _check_alone(self) -> None:
-        """Raise DuplicateAddressError where a write would reach others too.
+        """Raise SharedAddressError where a write would reach others too.
 
         2.17 without load balancing has the address at which all others listen.
         """
@@ -105,7 +105,7 @@ class PolledBox(SmartEvseBox):
                 f"{self.config.name} has address 0, at which every SmartEVSE listens: "
                 "nothing is written while others are on its bus"
             )
-            raise DuplicateAddressError(message)
+            raise SharedAddressError(message)
 
     # -- The end ---------------------------------------------------------------------
 
