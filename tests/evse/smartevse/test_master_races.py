@@ -77,7 +77,7 @@ def test_a_broadcast_that_is_late_goes_before_what_waited_longer() -> None:
     simulate(scene())
 
 
-@pytest.mark.parametrize("before", [0.1 * step for step in range(1, 9)])
+@pytest.mark.parametrize("before", [0.1, 0.2, 0.3, 0.5])
 def test_making_room_holds_no_broadcast_up(before: float) -> None:
     """Those that must make room do not answer: each costs a whole time-out."""
 
@@ -201,6 +201,28 @@ def test_nothing_is_granted_to_a_box_that_was_stopped_for_want_of_supply() -> No
             for answer in answers(scene, asked):
                 assert answer.data[4:6] == b"\x00\x00", answer
             assert scene.offers == 0
+
+    simulate(scene())
+
+
+def test_after_a_restart_nothing_is_given_back() -> None:
+    """Who stopped it is not remembered: it may have been somebody at the box."""
+
+    async def scene() -> None:
+        async with MasterScene(units=(2,), watch=False) as scene:
+            await asyncio.sleep(5)
+            await scene.charge(2)
+            await asyncio.sleep(3)
+            await scene.master.change_supply(Supply(limit=5.0))
+            await asyncio.sleep(3)
+            await scene.bus.stop()
+            scene.new_bus()
+            slave = scene.add(2)
+            await scene.bus.start()
+            await asyncio.sleep(100)
+            assert scene.offers == 0
+            await slave.change_orders(OrderChange(allowed=True))
+            await scene.until(lambda: scene.offers == 16)
 
     simulate(scene())
 
@@ -330,5 +352,28 @@ def test_a_slow_network_port(delay: float, jitter: float) -> None:
             await asyncio.gather(*orders)
         assert max(scene.gaps()) < 5
         assert charged > 20
+
+    simulate(scene())
+
+
+@pytest.mark.parametrize("before", [0.2, 0.4, 0.6])
+def test_an_older_request_is_not_answered_after_a_newer_one(before: float) -> None:
+    """82 to a box that charges by now: it says B, and its contactor stays closed."""
+
+    async def scene() -> None:
+        scene = MasterScene(units=(2, 3, 4), limit=32.0, current=32.0, maximum=32)
+        async with scene:
+            await asyncio.sleep(5)
+            await scene.charge(2, 4)
+            await asyncio.sleep(13)
+            await scene.until(lambda: scene.offers == 32)
+            await asyncio.sleep(scene.master.slot.ready + PERIOD - before - now())
+            scene.box(2).deaf = scene.box(4).deaf = True
+            asked = now()
+            scene.line.say(frame("030600020082"))
+            scene.line.say(frame("030600030082"))
+            await asyncio.sleep(1.9)
+            kinds = [answer.data[3] for answer in answers(scene, asked)]
+            assert kinds in ([], [0x83], [0x82], [0x82, 0x83])
 
     simulate(scene())
