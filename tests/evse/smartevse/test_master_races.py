@@ -168,6 +168,30 @@ def test_a_request_from_before_a_no_at_the_box_is_not_granted() -> None:
     simulate(scene())
 
 
+@pytest.mark.parametrize("want", ["supply", "limit"])
+def test_a_no_at_the_box_right_before_our_own_stop_stays(want: str) -> None:
+    """It was not read yet: what we stop then is not ours to give back."""
+
+    async def scene() -> None:
+        async with MasterScene(units=(2,), watch=False) as scene:
+            await asyncio.sleep(5)
+            await scene.charge(2)
+            await scene.until(lambda: scene.slave(2).slot.ready - now() > 1.9)
+            scene.box(2).controller.outlet.set_access(False)
+            if want == "supply":
+                await scene.master.change_supply(Supply(limit=5.0))
+                await asyncio.sleep(3)
+                await scene.master.change_supply(Supply(limit=16.0))
+            else:
+                await scene.slave(2).change_orders(OrderChange(current=0.0))
+                await scene.slave(2).change_orders(OrderChange(current=16.0))
+            await asyncio.sleep(100)
+            assert scene.frames(START) == []
+            assert scene.offers == 0
+
+    simulate(scene())
+
+
 def test_a_yes_at_the_box_costs_a_second_and_not_a_minute() -> None:
     async def scene() -> None:
         async with MasterScene(units=(2,)) as scene:

@@ -11,7 +11,7 @@ from functools import partial
 from math import inf
 from typing import Final, override
 
-from ..errors import NotAvailableError, NotConfirmedError
+from ..errors import EvseError, NotAvailableError, NotConfirmedError
 from ..exchange import Talk
 from ..framing import Frame
 from ..jobs import Later
@@ -64,8 +64,13 @@ class SlaveSmartEvse(Member):
     async def _turn(self, talk: Talk, allowed: bool) -> Turns:  # noqa: FBT001
         """Set the access bit, and remember whether that was our own doing."""
         if not allowed:
-            had_access = self.status is None or self.status.access
             own = self._standing.allowed is not False
+            if own:
+                # Somebody at the box may have been first: that is not ours to undo.
+                with suppress(EvseError):
+                    await self.look(talk)
+                yield 0.0
+            had_access = self.status is None or self.status.access
             self._is_ours = own and (had_access or self._is_ours)
         still = self._may_be_on if allowed else self._must_be_off
         async for pause in self.set_access(talk, allowed, still):
