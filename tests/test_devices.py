@@ -18,7 +18,7 @@ from tests.common import (
     state_of,
     wait_for_state,
 )
-from tests.virtual import AblBox, EvboxChargePoint
+from tests.virtual import AblBox, EvboxChargePoint, SmartEvse
 
 
 async def test_devices_hang_together(hass: HomeAssistant) -> None:
@@ -44,6 +44,32 @@ async def test_devices_hang_together(hass: HomeAssistant) -> None:
             assert module.name == f"Module {number}"
             power = entity_id(hass, "sensor", entry, f"{number}_power")
             assert er.async_get(hass).async_get(power).device_id == module.id
+
+
+async def test_what_a_charger_was_stays_known_while_it_is_off(
+    hass: HomeAssistant,
+) -> None:
+    box = SmartEvse("2.20")
+    async with running(hass, box) as (entry, bus):
+
+        def shown() -> tuple[str | None, ...]:
+            device = dr.async_get(hass).async_get_device_by_identifier(
+                (DOMAIN, "smartevse1"), "bus"
+            )
+            return device.manufacturer, device.model, device.sw_version
+
+        status = await get_entity(hass, "sensor", entry, "1_status")
+        before = shown()
+        assert before == ("Stegen Electronics", "SmartEVSE v2", "2.20")
+        bus.remove(box)
+        await wait_for_state(hass, status, "unavailable")
+        assert shown() == before
+        await hass.config_entries.async_reload(entry.entry_id)
+        assert shown() == before
+        # Another firmware was loaded meanwhile.
+        bus.add(SmartEvse("2.17", load_balance=1))
+        await get_entity(hass, "sensor", entry, "1_status")
+        assert shown() == (*before[:2], "2.17")
 
 
 async def test_the_only_connector_is_no_device(hass: HomeAssistant) -> None:

@@ -1,6 +1,6 @@
 """The devices of a bus: the bus, its chargers behind it, their connectors."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from homeassistant.helpers import device_registry as dr, entity_registry as er
 from homeassistant.helpers.device_registry import ChildDeviceInfo, DeviceInfo
@@ -48,17 +48,25 @@ class BusDevices:
     def show_charger(self, unit: ChargerUnit) -> None:
         """Register a charger, or what has been learnt of it."""
         info = unit.charger.info
+        told: dict[str, Any] = {}
+        if info is not None:
+            told = {
+                "manufacturer": info.manufacturer,
+                "model": info.model,
+                "sw_version": info.firmware,
+                "hw_version": info.hardware,
+            }
+        elif not self.has(unit.subentry_id):
+            # What it told before stands: it may only be switched off.
+            told = {"model": self._protocol_name}
         device = self._registry.async_get_or_create(
             config_entry_id=self._entry.entry_id,
             config_subentry_id=unit.subentry_id,
             identifiers={(DOMAIN, unit.subentry_id)},
             name=unit.name,
             via_device_id=self._bus_id,
-            manufacturer=info.manufacturer if info else None,
-            model=info.model if info else self._protocol_name,
             serial_number=(info and info.serial) or unit.charger.config.serial,
-            sw_version=info.firmware if info else None,
-            hw_version=info.hardware if info else None,
+            **told,
         )
         unit.device_id = device.id
         if not unit.split and (len(unit.numbers) > 1 or self._was_split(unit)):
