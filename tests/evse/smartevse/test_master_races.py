@@ -1,105 +1,22 @@
-"""What crosses on the wire, comes late, or is done at the box, under our master."""
+"""What is said at the box, or by us, while something else is on its way."""
 
 import asyncio
 from contextlib import suppress
-from functools import partial
-from random import Random
 
 import pytest
 
 from custom_components.evse_bus.evse.errors import EvseError
-from custom_components.evse_bus.evse.exchange import Talk
-from custom_components.evse_bus.evse.jobs import Later
 from custom_components.evse_bus.evse.model import (
     Fault,
     OrderChange,
-    Persistence,
     Supply,
 )
-from custom_components.evse_bus.evse.smartevse.master import ECHO, PERIOD
-from tests.evse.simulated import SimulatedLoop, now, simulate
+from tests.evse.simulated import now, simulate
 from tests.evse.smartevse.ether import MasterScene
-from tests.evse.smartevse.far import FarEther
-from tests.evse.smartevse.test_master_others import FOREIGN
-from tests.evse.smartevse.test_master_requests import ASKS, answers, frame
+from tests.evse.smartevse.test_master_requests import ASKS, answers
 
 ACCESS = b"\x10\x00\xa7"
 START = "021000a70001020001"
-
-
-def test_late_echoes_of_several_broadcasts_are_no_other_master() -> None:
-    """A network port hands its echo on when we have said something else already."""
-
-    async def scene() -> None:
-        async with MasterScene(units=(2,)) as scene:
-            await asyncio.sleep(5)
-            await scene.charge(2)
-            line = scene.line
-            write = line.write
-            loop = asyncio.get_running_loop()
-
-            def echoing(data: bytes, *, reply_may_equal: bool = False) -> float:
-                end = write(data, reply_may_equal=reply_may_equal)
-                loop.call_at(end + 0.3, line.noise, data)
-                return end
-
-            line.write = echoing  # type: ignore[method-assign]
-            for current in (15.0, 14.0, 13.0, 12.0, 11.0, 10.0):
-                await scene.slave(2).change_orders(OrderChange(current=current))
-            await asyncio.sleep(2 * ECHO)
-            assert scene.master.noticed == frozenset()
-            assert scene.offers == 10
-
-    simulate(scene())
-
-
-async def endless(left: int, _talk: Talk) -> Later[None] | None:
-    await asyncio.sleep(0.45)
-    return Later(0.0, partial(endless, left - 1)) if left else None
-
-
-def test_a_broadcast_that_is_late_goes_before_what_waited_longer() -> None:
-    """Home Assistant hangs for a moment, and long conversations are under way."""
-
-    async def scene() -> None:
-        async with MasterScene(units=(2, 3)) as scene:
-            await asyncio.sleep(6)
-            for unit in (2, 3):
-                later = Later[None](0.0, partial(endless, 10), 0.45)
-                scene.bus._follow_up(scene.slave(unit), later, Persistence.ONCE)
-            loop = asyncio.get_running_loop()
-            assert isinstance(loop, SimulatedLoop)
-            planned = scene.master.slot.ready
-            loop.call_at(planned - 0.01, setattr, loop, "now", planned + 0.1)
-            await asyncio.sleep(15)
-            assert max(scene.gaps()) < PERIOD + 0.7
-
-    simulate(scene())
-
-
-@pytest.mark.parametrize("before", [0.1, 0.2, 0.3, 0.5])
-def test_making_room_holds_no_broadcast_up(before: float) -> None:
-    """Those that must make room do not answer: each costs a whole time-out."""
-
-    async def scene() -> None:
-        scene = MasterScene(units=(2, 3, 4), limit=32.0, current=32.0, maximum=32)
-        async with scene:
-            await asyncio.sleep(5)
-            await scene.charge(2, 4)
-            await asyncio.sleep(13)
-            scene.box(3).car.plug_in(request=False)
-            await scene.until(lambda: scene.box(3).state == "B")
-            await scene.until(lambda: scene.offers == 32)
-            await asyncio.sleep(scene.master.slot.ready + PERIOD - before - now())
-            scene.box(2).deaf = scene.box(4).deaf = True
-            statistics = scene.bus.wire.statistics
-            missed, timeouts = statistics.missed_deadlines, statistics.timeouts
-            scene.line.say(frame("030600030082"))
-            await asyncio.sleep(1.9)
-            assert statistics.missed_deadlines == missed
-            assert statistics.timeouts > timeouts
-
-    simulate(scene())
 
 
 def test_who_does_not_hear_its_stop_is_granted_current_again_later() -> None:
@@ -318,86 +235,5 @@ def test_a_limit_is_not_overtaken_by_the_stop_before_it() -> None:
             await scene.until(lambda: scene.offers == 10)
             await asyncio.sleep(30)
             assert scene.offers == 10
-
-    simulate(scene())
-
-
-def test_beside_another_master_requests_leave_nothing_behind() -> None:
-    async def scene() -> None:
-        async with MasterScene(units=(2,)) as scene:
-            await asyncio.sleep(6)
-            scene.line.say(FOREIGN)
-            for _ in range(40):
-                await asyncio.sleep(1)
-                scene.line.say(ASKS)
-            assert list(scene.bus._jobs) == []
-
-    simulate(scene())
-
-
-@pytest.mark.parametrize(
-    ("delay", "jitter"), [(0.1, 0.0), (0.02, 1.0), (0.08, 0.5), (0.02, 3.0)]
-)
-def test_a_slow_network_port(delay: float, jitter: float) -> None:
-    """Both ways have a delay, and now and then one that is longer than a time-out."""
-
-    async def scene() -> None:
-        dice = Random(3)  # noqa: S311 - the same each time
-        scene = MasterScene(units=(), limit=25.0, maximum=32)
-        scene.line = FarEther(delay, jitter, dice)
-        scene.new_bus()
-        for unit in (2, 3, 4):
-            scene.plug_box(unit)
-            scene.add(unit)
-        charged = 0
-        orders: set[asyncio.Task[None]] = set()
-
-        async def order() -> None:
-            slave = scene.slave(dice.choice((2, 3, 4)))
-            with suppress(EvseError):
-                current = dice.choice((6.0, 10.0, 16.0, 32.0))
-                await slave.change_orders(OrderChange(current=current))
-
-        async with scene:
-            await asyncio.sleep(8)
-            for _ in range(100):
-                car = scene.box(dice.choice((2, 3, 4))).car
-                match dice.randrange(4):
-                    case 0:
-                        (car.leave if car.plugged else car.plug_in)()
-                    case 1:
-                        car.request()
-                    case 2:
-                        car.finish()
-                    case _:
-                        orders.add(asyncio.create_task(order()))
-                await asyncio.sleep(dice.choice((0.02, 0.3, 1.3, 5.0)))
-                charged += scene.offers > 0
-            await asyncio.gather(*orders)
-        assert max(scene.gaps()) < 5
-        assert charged > 20
-
-    simulate(scene())
-
-
-@pytest.mark.parametrize("before", [0.2, 0.4, 0.6])
-def test_an_older_request_is_not_answered_after_a_newer_one(before: float) -> None:
-    """82 to a box that charges by now: it says B, and its contactor stays closed."""
-
-    async def scene() -> None:
-        scene = MasterScene(units=(2, 3, 4), limit=32.0, current=32.0, maximum=32)
-        async with scene:
-            await asyncio.sleep(5)
-            await scene.charge(2, 4)
-            await asyncio.sleep(13)
-            await scene.until(lambda: scene.offers == 32)
-            await asyncio.sleep(scene.master.slot.ready + PERIOD - before - now())
-            scene.box(2).deaf = scene.box(4).deaf = True
-            asked = now()
-            scene.line.say(frame("030600020082"))
-            scene.line.say(frame("030600030082"))
-            await asyncio.sleep(1.9)
-            kinds = [answer.data[3] for answer in answers(scene, asked)]
-            assert kinds in ([], [0x83], [0x82], [0x82, 0x83])
 
     simulate(scene())
