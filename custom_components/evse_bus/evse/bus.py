@@ -62,6 +62,7 @@ class Bus:
         self.chargers: dict[str, Charger] = {}
         self.connected = False
         """The port is open."""
+        self._was_open = False
         self.shared: object | None = None
         """What its chargers know together, where they are connectors of one box."""
         self._jobs = JobQueue()
@@ -389,7 +390,7 @@ class Bus:
     # -- The port ----------------------------------------------------------------
 
     def _on_open(self) -> None:
-        self.connected = True
+        self.connected = self._was_open = True
         self.wire.reset()
         now = asyncio.get_running_loop().time()
         for charger in self.chargers.values():
@@ -436,8 +437,9 @@ class Bus:
                 _LOGGER.debug("%s: still not there: %s", self.name, error)
                 pause = min(pause * 2, REOPEN_LIMIT)
                 continue
-            _LOGGER.warning("%s: the port is back", self.name)
-            self.wire.statistics.reopened += 1
+            if self._was_open:
+                _LOGGER.warning("%s: the port is back", self.name)
+                self.wire.statistics.reopened += 1
             self._on_open()
             return True
 

@@ -193,6 +193,11 @@ class EwsPort(Charger):
         if self.bus is not None:
             self.bus.look_again()
 
+    def ask_now(self) -> None:
+        """Poll as soon as the bus is free, however fresh what is known may be."""
+        self.box.ports_at = -inf
+        self.hurry()
+
     # -- The regular exchange ------------------------------------------------------
 
     @override
@@ -356,19 +361,19 @@ class EwsPort(Charger):
         try:
             async for pause in self.ready(talk):
                 yield pause
-            if clamp(self.target(change), self.limits).paused:
-                ours = self.target(change).allowed is not False
+            if clamp(self.sought(change), self.limits).paused:
+                ours = self.sought(change).allowed is not False
                 async for pause in self.permission.pause(talk, for_current=ours):
                     yield pause
                 return
-            async for pause in self.limiter.enforce(talk, lambda: self.target(change)):
+            async for pause in self.limiter.enforce(talk, lambda: self.sought(change)):
                 yield pause
             if not self.permission.may_start(change):
                 return
 
             def still() -> bool:
                 # Not where a pause came meanwhile: that one is on its way.
-                return not clamp(self.target(change), self.limits).paused
+                return not clamp(self.sought(change), self.limits).paused
 
             yield 0.0
             async for pause in self.permission.start(talk, still):

@@ -182,6 +182,19 @@ class EwsBox:
 
     # -- Who it is -----------------------------------------------------------------
 
+    async def identify(self, talk: Talk) -> BoxStatus:
+        """Ask who it is, under one reading of the checksum and the other, until told.
+
+        Nothing but ``id`` and ``rs``. Raises LineError, and ImplausibleReplyError or
+        ExchangeRefusedError for what is no EWS-Box; silence is the caller's to end.
+        """
+        while True:
+            try:
+                await self._find_reading(talk)
+                return await self.read_status(talk)
+            except ReplyTimeoutError:
+                continue
+
     async def meet(self, talk: Talk) -> Turns:
         """Find out who answers, and what is installed, one exchange a turn.
 

@@ -1,0 +1,257 @@
+"""A line that a box has opened: the box is the client and dials us (manual, 3.1.4.2).
+
+There is no authentication in this protocol: whoever connects may be anybody, and is
+given little time, few bytes and no trust. Nothing that passes is logged.
+"""
+
+import asyncio
+from collections.abc import Callable
+from ipaddress import IPv4Address, IPv6Address, ip_address
+import logging
+from typing import ClassVar, Final, override
+
+from ..errors import LineLostError, PortMissingError
+from ..line import Line
+from .frames import LONGEST_FRAME
+from .timing import SETTINGS
+
+_LOGGER = logging.getLogger(__name__)
+
+type Address = IPv4Address | IPv6Address
+
+ANSWER_PATIENCE: Final = 15.0
+"""Commands that stay without an answer for so long end a connection, s."""
+MOST_NOISE: Final = LONGEST_FRAME
+"""Bytes that belong to no message, between two answers: more end a connection."""
+MOST_BYTES: Final = 8 * LONGEST_FRAME
+"""Bytes of any kind between two answers: more end a connection."""
+
+
+class Connection(asyncio.Protocol):
+    """One accepted connection; its bytes go to a line, or wait for one."""
+
+    def __init__(self, made: Callable[[Connection], None]) -> None:
+        """Call ``made`` when the connection stands."""
+        self._made = made
+        self._transport: asyncio.Transport | None = None
+        self._waiting = b""
+        self.line: AcceptedLine | None = None
+        self.on_gone: Callable[[], None] = lambda: None
+        """Called when it has ended."""
+        self.peer: Address | None = None
+
+    @property
+    def is_open(self) -> bool:
+        """Return whether it stands."""
+        return self._transport is not None
+
+    @override
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        if not isinstance(transport, asyncio.Transport):
+            raise TypeError(type(transport).__name__)
+        self._transport = transport
+        self.peer = _address(transport.get_extra_info("peername"))
+        self._made(self)
+
+    @override
+    def data_received(self, data: bytes) -> None:
+        if self.line is not None:
+            self.line.received(data)
+        elif len(self._waiting) + len(data) > MOST_BYTES:
+            self.abort()
+        else:
+            self._waiting += data
+
+    @override
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._ended(exc)
+
+    def keep(self, data: bytes) -> None:
+        """Let bytes wait for the line that comes next."""
+        self._waiting = (self._waiting + data)[-MOST_BYTES:]
+
+    def hand_over(self) -> None:
+        """Give the line what has come before it."""
+        waiting, self._waiting = self._waiting, b""
+        if self.line is not None and waiting:
+            self.line.received(waiting)
+
+    def write(self, data: bytes) -> None:
+        """Send bytes; LineLostError when it has ended."""
+        if self._transport is None or self._transport.is_closing():
+            raise LineLostError("the connection was closed")
+        self._transport.write(data)
+
+    def close(self) -> None:
+        """End it; what still waits to be sent is not waited for."""
+        transport = self._transport
+        if transport is None:
+            return
+        self._ended(None)
+        if transport.get_write_buffer_size():
+            transport.abort()
+        else:
+            transport.close()
+
+    def abort(self) -> None:
+        """End it without a word."""
+        transport = self._transport
+        if transport is not None:
+            self._ended(None)
+            transport.abort()
+
+    def _ended(self, error: Exception | None) -> None:
+        if self._transport is None:
+            return
+        self._transport = None
+        self._waiting = b""
+        line, self.line = self.line, None
+        if line is not None:
+            line.lost(error)
+        self.on_gone()
+
+
+def _address(peer: object) -> Address | None:
+    if not isinstance(peer, tuple) or not peer:
+        return None
+    address = ip_address(str(peer[0]).partition("%")[0])
+    return getattr(address, "ipv4_mapped", None) or address
+
+
+class AcceptedLine(Line):
+    """The line of one box, whichever connection it has now.
+
+    It has no open of its own: the listener brings the connection (`attach`), and a bus
+    that is told to look again finds it open.
+    """
+
+    opened_by_peer: ClassVar = True
+
+    def __init__(self, name: str, noise: Callable[[], int]) -> None:
+        """Take what counts the bytes that belong to no message."""
+        super().__init__(name, SETTINGS)
+        self.echoes = False
+        self._noise = noise
+        self._noise_before = 0
+        self._bytes_before = 0
+        self._next: Connection | None = None
+        self._connection: Connection | None = None
+        self._watch: asyncio.TimerHandle | None = None
+        self._proof: asyncio.Future[bool] | None = None
+
+    @property
+    @override
+    def is_open(self) -> bool:
+        return self._connection is not None
+
+    @property
+    def waits(self) -> bool:
+        """Return whether a connection waits for `open`."""
+        return self._next is not None and self._next.is_open
+
+    def attach(self, connection: Connection) -> None:
+        """Let this be the next connection; an older one that still waits is ended."""
+        if self._next is not None:
+            self._next.abort()
+        self._next = connection
+
+    @override
+    async def open(self) -> None:
+        """Begin with the connection that waits; PortMissingError: there is none."""
+        connection, self._next = self._next, None
+        if connection is None or not connection.is_open:
+            message = f"{self.url} has not connected"
+            raise PortMissingError(message)
+        self._connection = connection
+        connection.line = self
+        self.statistics.opened += 1
+        self._note_progress()
+        loop = asyncio.get_running_loop()
+        self.last_activity = loop.time()
+        # Whoever opens gets ready first; then what has come so far.
+        loop.call_soon(connection.hand_over)
+
+    def release(self) -> None:
+        """Let the connection go, for another line."""
+        self._connection = None
+        self._stop_watch()
+
+    @override
+    async def close(self) -> None:
+        connection, self._connection = self._connection, None
+        waiting, self._next = self._next, None
+        self._stop_watch()
+        for one in (connection, waiting):
+            if one is not None:
+                one.line = None
+                one.close()
+
+    @override
+    def write(self, data: bytes, *, reply_may_equal: bool = False) -> float:
+        if self._connection is None:
+            message = f"{self.url} is not connected"
+            raise LineLostError(message)
+        self._connection.write(data)
+        self.statistics.bytes_out += len(data)
+        loop = asyncio.get_running_loop()
+        if self._watch is None:
+            self._watch = loop.call_later(ANSWER_PATIENCE, self.end, "no answer")
+        self.last_activity = loop.time()
+        return self.last_activity
+
+    def received(self, data: bytes) -> None:
+        """Take bytes of the connection; too many that answer nothing end it."""
+        self._received(data)
+        if self.statistics.bytes_in - self._bytes_before > MOST_BYTES:
+            self.end("too many bytes")
+        elif self._noise() - self._noise_before > MOST_NOISE:
+            self.end("no message in so many bytes")
+
+    @override
+    def answered(self) -> None:
+        self._note_progress()
+        if self._proof is not None and not self._proof.done():
+            self._proof.set_result(True)
+
+    def _note_progress(self) -> None:
+        self._noise_before = self._noise()
+        self._bytes_before = self.statistics.bytes_in
+        self._stop_watch()
+
+    def _stop_watch(self) -> None:
+        if self._watch is not None:
+            self._watch.cancel()
+            self._watch = None
+
+    async def answers(self, patience: float) -> bool:
+        """Return whether the connection answers a command within this time, s.
+
+        Somebody else asks: the bus, which is to be told that it is urgent.
+        """
+        if self._connection is None:
+            return False
+        self._proof = asyncio.get_running_loop().create_future()
+        try:
+            async with asyncio.timeout(patience):
+                return await self._proof
+        except TimeoutError:
+            return False
+        finally:
+            self._proof = None
+
+    def end(self, why: str) -> None:
+        """End the connection; the bus notices as with an adapter that is unplugged."""
+        if self._connection is not None:
+            _LOGGER.debug("%s: connection ended: %s", self.url, why)
+            self._connection.abort()
+
+    def lost(self, error: Exception | None) -> None:
+        """Take note that the connection has ended."""
+        if self._connection is None:
+            return
+        self._connection = None
+        self._stop_watch()
+        self.statistics.lost += 1
+        if self._proof is not None and not self._proof.done():
+            self._proof.set_result(False)
+        self.on_lost(LineLostError(str(error) if error else "connection closed"))

@@ -1,0 +1,122 @@
+"""Any orders in any order, with lost answers: what must never happen does not.
+
+The virtual port is the witness: no cable is unlocked that nobody asked for, no current
+is above the ceiling once the first limit has been taken, nothing starts by itself.
+"""
+
+import asyncio
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+from hypothesis import given, settings, strategies as st
+
+from custom_components.evse_bus.evse.errors import EvseError
+from custom_components.evse_bus.evse.model import Command, OrderChange
+
+from .ether import EwsScene, play
+
+WAITS = st.sampled_from((0.0, 0.05, 0.3, 1.0, 3.0, 8.0))
+ACTS = st.one_of(
+    st.tuples(st.just("allow"), st.booleans(), WAITS),
+    st.tuples(st.just("limit"), st.sampled_from((0.0, 6.0, 10.0, 16.0, 32.0)), WAITS),
+    st.tuples(st.just("car"), st.sampled_from(("ask", "finish")), WAITS),
+    st.tuples(st.just("lose"), st.sampled_from(("rc", "rd", "sl", "st")), WAITS),
+    st.tuples(st.just("deaf"), st.sampled_from(("rc", "rd", "sl", "st")), WAITS),
+    st.tuples(st.just("line"), st.just(None), WAITS),
+    st.tuples(st.just("optimise"), st.booleans(), WAITS),
+)
+
+
+@dataclass
+class Run:
+    scene: EwsScene
+    lost: list[str] = field(default_factory=list)
+    deaf: list[str] = field(default_factory=list)
+    tasks: list[asyncio.Task[None]] = field(default_factory=list)
+    starts_wanted: int = 0
+
+    def __post_init__(self) -> None:
+        self.scene.line.mute = lambda name: self._take(self.lost, name)
+        self.scene.line.deaf = lambda name: self._take(self.deaf, name)
+
+    @staticmethod
+    def _take(names: list[str], name: str) -> bool:
+        if name not in names:
+            return False
+        names.remove(name)
+        return True
+
+    async def change(self, change: OrderChange) -> None:
+        with suppress(EvseError):
+            await self.scene.charger().change_orders(change)
+
+    async def optimise(self, value: object) -> None:
+        with suppress(EvseError):
+            await self.scene.charger().command(Command.SET_OPTIMISED, bool(value))
+
+    async def act(self, what: str, value: object) -> None:
+        if what == "allow":
+            self.tasks.append(
+                asyncio.ensure_future(self.change(OrderChange(allowed=bool(value))))
+            )
+        elif what == "limit":
+            assert isinstance(value, float)
+            self.tasks.append(
+                asyncio.ensure_future(self.change(OrderChange(current=value)))
+            )
+        elif what == "car":
+            car = self.scene.cars[0]
+            (car.request if value == "ask" else car.finish)()
+        elif what == "lose":
+            self.lost.append(str(value))
+        elif what == "deaf":
+            self.deaf.append(str(value))
+        elif what == "optimise":
+            self.tasks.append(asyncio.ensure_future(self.optimise(value)))
+        else:
+            self.scene.line.unplug()
+
+
+@settings(max_examples=60)
+@given(
+    acts=st.lists(ACTS, max_size=12),
+    pause_status=st.sampled_from((0x50, 0x42)),
+    charging=st.booleans(),
+)
+def test_any_orders(
+    acts: list[tuple[str, object, float]], pause_status: int, *, charging: bool
+) -> None:
+    async def happens(scene: EwsScene) -> None:
+        port = scene.box.ports[0]
+        port.pause_status = pause_status  # type: ignore[assignment]
+        run = Run(scene)
+        scene.cars[0].plug_in()
+        await scene.until(lambda: scene.status() == 0x30)
+        if charging:
+            await scene.charge()
+        begun = len(scene.line.sent)
+        wanted = False
+        for what, value, wait in acts:
+            wanted |= (what, value) == ("allow", True)
+            await run.act(what, value)
+            await asyncio.sleep(wait)
+        await asyncio.sleep(30)
+        run.lost.clear()
+        run.deaf.clear()
+        await asyncio.sleep(60)
+        assert not scene.unlocked()
+        assert not port.witness.unlocked_under_power
+        said = scene.line.sent[begun:]
+        assert all(one.parameters[1] for one in said if one.name == "st")
+        if not wanted and not charging:
+            assert not scene.starts()
+        ceiling = 25
+        assert port.witness.highest_offer <= ceiling
+        orders = scene.charger().orders
+        if scene.charger().setpoint.paused:
+            assert port.status not in (0x40, 0x41)
+        else:
+            assert port.limit == min(orders.limit.current, ceiling)
+        await asyncio.gather(*run.tasks)
+
+    play(EwsScene(installation=25.0, ports=(1,)), happens)

@@ -1,0 +1,500 @@
+"""Pausing and starting: `sl` 6 and `sl` 3, each in its states, whatever gets lost."""
+
+import asyncio
+from contextlib import suppress
+
+import pytest
+
+from custom_components.evse_bus.evse.errors import (
+    EvseError,
+    NotAvailableError,
+    NotConfirmedError,
+)
+from custom_components.evse_bus.evse.ews.answers import EwsRefusedError, Refusal
+from custom_components.evse_bus.evse.ews.events import (
+    ChargeEnded,
+    ChargeStarted,
+    StartRequested,
+)
+from custom_components.evse_bus.evse.ews.states import STATES
+from custom_components.evse_bus.evse.ews.status import ChargeResult
+from custom_components.evse_bus.evse.model import Fault, OrderChange, Status
+
+from .ether import EwsScene, now, play
+
+ON = OrderChange(allowed=True)
+OFF = OrderChange(allowed=False)
+STOP, START, PAUSE = 1, 3, 6
+
+
+def amperes(current: float) -> OrderChange:
+    return OrderChange(current=current)
+
+
+@pytest.mark.parametrize("pause_status", [0x50, 0x42])
+def test_a_pause_keeps_the_cable_locked_and_ends_in_the_same_charge(
+    pause_status: int,
+) -> None:
+    async def acts(scene: EwsScene) -> None:
+        scene.box.ports[0].pause_status = pause_status  # type: ignore[assignment]
+        await scene.charge()
+        await scene.charger().change_orders(OFF)
+        assert scene.status() == pause_status
+        assert scene.box.ports[0].locked
+        assert scene.connector().status is Status.SUSPENDED_EVSE
+        assert scene.reading().allowed is False
+        assert scene.reading().offered_current == 0
+        await asyncio.sleep(60)
+        assert len(scene.line.orders(PAUSE)) == 1
+        await scene.charger().change_orders(ON)
+        await scene.until(lambda: scene.status() == 0x40)
+        await asyncio.sleep(10)
+        assert scene.connector().status is Status.CHARGING
+        assert not scene.unlocked()
+        assert scene.starts() == ["sl 3", "sl 3"]
+        assert scene.events.count(ChargeStarted(port=1)) == 1
+        assert not any(isinstance(event, ChargeEnded) for event in scene.events)
+
+    play(EwsScene(), acts)
+
+
+def test_every_pause_follows_an_rc_in_the_same_turn() -> None:
+    async def acts(scene: EwsScene) -> None:
+        await scene.charge()
+        await scene.charger().change_orders(OFF)
+        names = [one.name for one in scene.line.sent]
+        for at, name in enumerate(names):
+            if name == "sl":
+                assert names[at - 1] == "rc"
+        sl, rc = (scene.line.named(name)[-1] for name in ("sl", "rc"))
+        assert rc.when > sl.when
+
+    play(EwsScene(), acts)
+
+
+@pytest.mark.parametrize("status", sorted(set(STATES) - {0xF0}))
+def test_a_pause_is_sent_only_where_something_charges(status: int) -> None:
+    async def acts(scene: EwsScene) -> None:
+        port = scene.box.ports[0]
+        port.step = lambda _now: None  # type: ignore[method-assign]
+        port.pause = lambda: setattr(port, "status", 0x50)  # type: ignore[method-assign]
+        port.status = status
+        port.relay.closed = status in (0x40, 0x41)
+        await scene.until(lambda: scene.connector().raw_state == f"0x{status:02X}")
+        await scene.charger().change_orders(OFF)
+        await asyncio.sleep(30)
+        running = status in (0x40, 0x41, 0x42, 0x43)
+        assert len(scene.line.orders(PAUSE)) == running
+        assert not scene.line.orders(START)
+
+    play(EwsScene(), acts)
+
+
+@pytest.mark.parametrize("status", sorted(set(STATES) - {0x30, 0xF0}))
+def test_a_start_is_sent_only_to_a_car_that_waits(status: int) -> None:
+    async def acts(scene: EwsScene) -> None:
+        port = scene.box.ports[0]
+        port.step = lambda _now: None  # type: ignore[method-assign]
+        port.status = status
+        await scene.until(lambda: scene.connector().raw_state == f"0x{status:02X}")
+        faulted = status in (0xA0, 0xA1, 0xA2, 0xA3, 0xA4, 0xA5, 0xA7, 0xA8, 0xFF)
+        if faulted:
+            with pytest.raises(NotAvailableError, match="not in state"):
+                await scene.charger().change_orders(ON)
+        else:
+            await scene.charger().change_orders(ON)
+            assert scene.charger().orders.allowed is True
+        await asyncio.sleep(10)
+        assert not scene.line.orders()
+
+    play(EwsScene(), acts)
+
+
+def test_a_car_that_comes_later_is_not_started_by_an_old_word() -> None:
+    async def acts(scene: EwsScene) -> None:
+        await scene.charger().change_orders(ON)
+        await scene.plug()
+        await asyncio.sleep(120)
+        assert scene.status() == 0x30
+        assert scene.reading().allowed is False
+        assert not scene.line.orders()
+        scene.box.press_key(1, 1)
+        await scene.until(lambda: scene.connector().start_requested)
+        assert StartRequested(port=1) in scene.events
+        await asyncio.sleep(20)
+        assert not scene.line.orders()
+        await scene.charger().change_orders(ON)
+        await scene.until(lambda: scene.status() == 0x40)
+
+    play(EwsScene(), acts)
+
+
+def test_a_pause_of_somebody_else_is_not_ended_by_us() -> None:
+    async def acts(scene: EwsScene) -> None:
+        await scene.charge()
+        scene.box.press_key(1, 2)
+        await scene.until(lambda: scene.status() == 0x50)
+        await asyncio.sleep(3)
+        assert ChargeEnded(port=1, result=ChargeResult.STOPPED) in scene.events
+        begin = now()
+        await scene.charger().change_orders(ON)
+        await scene.charger().change_orders(amperes(20.0))
+        assert not scene.line.orders(since=begin)
+
+    play(EwsScene(), acts)
+
+
+# -- Limit and permission -----------------------------------------------------------
+
+
+def test_a_limit_of_zero_pauses_and_a_higher_one_goes_on() -> None:
+    async def acts(scene: EwsScene) -> None:
+        await scene.charge()
+        await scene.charger().change_orders(amperes(0.0))
+        assert scene.status() == 0x50
+        assert scene.charger().waits_for_current
+        await asyncio.sleep(20)
+        # What counts if somebody starts it at the box.
+        assert scene.box.ports[0].limit == 6
+        await scene.charger().change_orders(amperes(12.0))
+        await scene.until(lambda: scene.status() == 0x40)
+        assert scene.box.ports[0].limit == 12
+        assert 0 not in scene.line.limits()
+        assert not scene.unlocked()
+
+    play(EwsScene(), acts)
+
+
+def test_no_change_of_a_limit_ends_the_users_pause() -> None:
+    async def acts(scene: EwsScene) -> None:
+        await scene.charge()
+        await scene.charger().change_orders(OFF)
+        for current in (0.0, 10.0, 32.0):
+            await scene.charger().change_orders(amperes(current))
+            await asyncio.sleep(5)
+        assert scene.status() == 0x50
+        assert len(scene.line.orders(START)) == 1
+        assert scene.box.ports[0].limit == 32
+
+    play(EwsScene(), acts)
+
+
+def test_a_new_car_is_not_started_by_a_limit() -> None:
+    async def acts(scene: EwsScene) -> None:
+        await scene.charge()
+        await scene.charger().change_orders(amperes(0.0))
+        scene.cars[0].leave()
+        await scene.until(lambda: scene.status() == 0x00)
+        await scene.plug()
+        begin = now()
+        await scene.charger().change_orders(amperes(16.0))
+        await asyncio.sleep(20)
+        assert not scene.line.orders(since=begin)
+        assert scene.status() == 0x30
+
+    play(EwsScene(), acts)
+
+
+def test_a_start_at_the_box_against_a_pause_is_paused_again() -> None:
+    async def acts(scene: EwsScene) -> None:
+        await scene.charger().change_orders(OFF)
+        scene.cars[0].plug_in()
+        await scene.until(lambda: scene.status() == 0x40)
+        took = await scene.until(lambda: scene.status() == 0x50)
+        assert took < 3.0
+        await asyncio.sleep(30)
+        assert len(scene.line.orders(PAUSE)) == 1
+        assert not scene.unlocked()
+
+    scene = EwsScene(options={"mode": "standalone"})
+    scene.seen.append(
+        lambda: (
+            scene.box.start_on_web_page(1)
+            if scene.status() == 0x30 and not scene.starts()
+            else None
+        )
+    )
+    play(scene, acts)
+
+
+# -- Lost answers -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("pause_status", [0x50, 0x42])
+@pytest.mark.parametrize("heard", [True, False])
+@pytest.mark.parametrize("times", [1, 2])
+def test_a_pause_whose_answer_is_lost(
+    *, heard: bool, times: int, pause_status: int
+) -> None:
+    """Also two in a row: never is there a 6 where the first one has worked."""
+
+    async def acts(scene: EwsScene) -> None:
+        scene.box.ports[0].pause_status = pause_status  # type: ignore[assignment]
+        await scene.charge()
+        begin = now()
+        left = times
+
+        def lose(name: str) -> bool:
+            nonlocal left
+            if name != "sl" or not left:
+                return False
+            left -= 1
+            return True
+
+        if heard:
+            scene.line.mute = lose
+        else:
+            scene.line.deaf = lose
+        with suppress(NotConfirmedError):
+            await scene.charger().change_orders(OFF)
+        await asyncio.sleep(40)
+        sixes = scene.line.orders(PAUSE, since=begin)
+        assert len(sixes) == (1 if heard else times + 1)
+        assert scene.status() == pause_status
+        assert scene.box.ports[0].locked
+        assert not scene.unlocked()
+        await scene.charger().change_orders(ON)
+        await scene.until(lambda: scene.status() == 0x40)
+
+    play(EwsScene(), acts)
+
+
+@pytest.mark.parametrize("lost", ["id", "rs", "rc", "rd", "st"])
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_a_pause_while_other_answers_are_lost(lost: str, count: int) -> None:
+    async def acts(scene: EwsScene) -> None:
+        await scene.charge()
+        left = count
+
+        def lose(name: str) -> bool:
+            nonlocal left
+            if name == lost and left:
+                left -= 1
+                return True
+            return False
+
+        scene.line.mute = lose
+        with suppress(EvseError):
+            await scene.charger().change_orders(OFF)
+        await scene.until(lambda: scene.status() == 0x50)
+        await asyncio.sleep(30)
+        assert len(scene.line.orders(PAUSE)) == 1
+        assert not scene.unlocked()
+
+    play(EwsScene(), acts)
+
+
+def test_a_late_answer_to_an_older_look_is_not_trusted() -> None:
+    """It says that the car charges; it does not any more when we order the pause."""
+
+    async def acts(scene: EwsScene) -> None:
+        await scene.charge()
+        begin = now()
+        scene.box.faults.once("late", 0.55)
+        scene.charger().ask_now()
+        await asyncio.sleep(0.3)
+        scene.box.press_key(1, 2)
+        with suppress(EvseError):
+            await scene.charger().change_orders(OFF)
+        await asyncio.sleep(20)
+        assert not scene.line.orders(PAUSE, since=begin)
+
+    play(EwsScene(), acts)
+
+
+@pytest.mark.parametrize("heard", [True, False])
+def test_a_start_whose_answer_is_lost(*, heard: bool) -> None:
+    async def acts(scene: EwsScene) -> None:
+        await scene.plug()
+        left = 1
+
+        def lose(name: str) -> bool:
+            nonlocal left
+            if name != "sl" or not left:
+                return False
+            left -= 1
+            return True
+
+        if heard:
+            scene.line.mute = lose
+        else:
+            scene.line.deaf = lose
+        await scene.charger().change_orders(ON)
+        await scene.until(lambda: scene.status() == 0x40)
+        assert len(scene.line.orders(START)) == (1 if heard else 2)
+
+    play(EwsScene(), acts)
+
+
+def test_a_box_that_does_not_pause_is_a_fault() -> None:
+    async def acts(scene: EwsScene) -> None:
+        await scene.charge()
+        scene.box.ports[0].pause = lambda: None  # type: ignore[method-assign]
+        with pytest.raises(NotConfirmedError):
+            await scene.charger().change_orders(OFF)
+        assert Fault.LIMIT_NOT_TAKEN in scene.charger().faults
+        assert scene.charger().orders.allowed is False
+        sixes = scene.line.orders(PAUSE)
+        assert len(sixes) == 2
+        assert sixes[1].when - sixes[0].when >= 5
+
+    play(EwsScene(), acts)
+
+
+def test_a_start_waits_for_a_box_that_is_starting() -> None:
+    async def acts(scene: EwsScene) -> None:
+        await scene.plug()
+        scene.box.power_cycle(0.5)
+        await scene.until(lambda: scene.status() == 0xF0)
+        await scene.until(lambda: scene.connector().raw_state == "0xF0")
+        began = now()
+        await scene.charger().change_orders(ON)
+        assert now() - began > 5
+        await scene.until(lambda: scene.status() == 0x40)
+
+    play(EwsScene(options={"init_time": 20.0}), acts)
+
+
+def test_it_does_not_wait_for_ever() -> None:
+    async def acts(scene: EwsScene) -> None:
+        await scene.plug()
+        scene.box.power_cycle(0.5)
+        await scene.until(lambda: scene.connector().raw_state == "0xF0")
+        with pytest.raises(NotAvailableError, match="starting up"):
+            await scene.charger().change_orders(ON)
+
+    play(EwsScene(options={"power_backup": True}), acts)
+
+
+def test_a_refusal_says_why() -> None:
+    async def acts(scene: EwsScene) -> None:
+        await scene.plug()
+        # The lock jams after the look at it.
+        scene.box.ports[0].release_start = lambda _why: None  # type: ignore[method-assign]
+        scene.line.deaf = lambda name: (
+            scene.box.trip_rcd(1) or True if name == "none" else False
+        )
+        original = scene.line.write
+
+        def write(data: bytes, *, reply_may_equal: bool = False) -> float:
+            if data[4:6] == b"sl":
+                scene.box.trip_rcd(1)
+            return original(data, reply_may_equal=reply_may_equal)
+
+        scene.line.write = write  # type: ignore[method-assign]
+        with pytest.raises(EwsRefusedError) as told:
+            await scene.charger().change_orders(ON)
+        assert told.value.reason is Refusal.RCD
+
+    play(EwsScene(), acts)
+
+
+# -- Restarts -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("pause_status", [0x50, 0x42])
+def test_a_restart_of_ours_does_not_unlock_what_we_have_paused(
+    pause_status: int,
+) -> None:
+    async def acts(scene: EwsScene) -> None:
+        scene.box.ports[0].pause_status = pause_status  # type: ignore[assignment]
+        await scene.charge()
+        await scene.charger().change_orders(OFF)
+        old = scene.charger()
+        await scene.bus.remove(old)
+        scene.allowed = False
+        scene.bus.shared = None
+        scene.bus.add(scene.make_charger(1))
+        await scene.until(lambda: scene.charger().reading is not None)
+        await scene.charger().change_orders(OFF)
+        await scene.charger().change_orders(amperes(0.0))
+        await asyncio.sleep(30)
+        assert scene.box.ports[0].locked
+        assert not scene.unlocked()
+        await scene.charger().change_orders(amperes(10.0))
+        await scene.charger().change_orders(ON)
+        await scene.until(lambda: scene.status() == 0x40)
+
+    play(EwsScene(), acts)
+
+
+def test_a_pause_lives_through_a_lost_line() -> None:
+    async def acts(scene: EwsScene) -> None:
+        await scene.charge()
+        await scene.charger().change_orders(OFF)
+        scene.line.unplug()
+        await asyncio.sleep(5)
+        await scene.until(lambda: scene.charger().reading is not None)
+        await asyncio.sleep(20)
+        assert scene.connector().status is Status.SUSPENDED_EVSE
+        assert len(scene.line.orders(PAUSE)) == 1
+        await scene.charger().change_orders(ON)
+        await scene.until(lambda: scene.status() == 0x40)
+
+    play(EwsScene(), acts)
+
+
+def test_a_line_lost_with_the_pause_on_its_way() -> None:
+    async def acts(scene: EwsScene) -> None:
+        await scene.charge()
+        scene.line.mute = lambda name: name == "sl"
+        task = asyncio.ensure_future(scene.charger().change_orders(OFF))
+        await scene.until(lambda: scene.status() == 0x50)
+        scene.line.unplug()
+        with pytest.raises(EvseError):
+            await task
+        await scene.until(lambda: scene.charger().reading is not None)
+        await asyncio.sleep(20)
+        assert len(scene.line.orders(PAUSE)) == 1
+        assert not scene.unlocked()
+        scene.line.mute = lambda _name: False
+        await scene.charger().change_orders(ON)
+        await scene.until(lambda: scene.status() == 0x40)
+
+    play(EwsScene(), acts)
+
+
+def test_somebody_unlocks_what_we_have_paused() -> None:
+    async def acts(scene: EwsScene) -> None:
+        await scene.charge()
+        await scene.charger().change_orders(OFF)
+        scene.box.press_key(1, 2)
+        await scene.until(lambda: not scene.box.ports[0].locked)
+        await asyncio.sleep(5)
+        assert scene.connector().status is Status.FINISHING
+        assert any(isinstance(event, ChargeEnded) for event in scene.events)
+        begin = now()
+        await scene.charger().change_orders(ON)
+        assert not scene.line.orders(since=begin)
+
+    play(EwsScene(), acts)
+
+
+def test_a_power_failure_with_a_start_of_its_own() -> None:
+    """The jumper's current counts until our limit is there again: soon."""
+
+    async def acts(scene: EwsScene) -> None:
+        await scene.charge()
+        await scene.charger().change_orders(amperes(10.0))
+        scene.box.power_cycle(3.0)
+        await scene.until(lambda: "power failure" in scene.starts())
+        took = await scene.until(lambda: scene.box.ports[0].limit == 10)
+        assert took < 5
+        await asyncio.sleep(5)
+        assert scene.reading().offered_current == 10
+
+    play(EwsScene(options={"restart_after_power": True}), acts)
+
+
+def test_a_power_failure_with_a_start_of_its_own_against_a_pause() -> None:
+    async def acts(scene: EwsScene) -> None:
+        await scene.charge()
+        scene.charger().orders = OFF.apply(scene.charger().orders)
+        scene.box.power_cycle(0.1)
+        await scene.until(lambda: "power failure" in scene.starts())
+        await scene.until(lambda: scene.status() in (0x50, 0x42))
+        await asyncio.sleep(20)
+        assert scene.status() == 0x50
+        assert scene.unlocked() == ["power failure"]
+
+    play(EwsScene(options={"restart_after_power": True}), acts)
