@@ -258,3 +258,32 @@ async def test_a_lowering_is_written_also_when_its_action_is_given_up(
         disk.set()
         await hass.async_block_till_done()
     assert hass_storage[STORE]["data"][ABL]["limit"]["current"] == 8.0
+
+
+async def test_who_reads_next_waits_for_what_is_being_written(
+    hass: HomeAssistant, hass_storage: dict[str, Any]
+) -> None:
+    hass_storage[STORE] = stored(14.0)
+    disk = asyncio.Event()
+    writing = asyncio.Event()
+    write = Store._async_write_data
+
+    async def slow(self: Store, data: dict[str, Any]) -> None:
+        writing.set()
+        await disk.wait()
+        await write(self, data)
+
+    store = OrderStore(hass, "bus")
+    await store.async_load()
+    lower = Orders(limit=CurrentLimit(current=8.0))
+    with patch.object(Store, "_async_write_data", slow):
+        commit = asyncio.create_task(store.async_commit(ABL, lower))
+        await writing.wait()
+        close = asyncio.create_task(store.async_close())
+        await asyncio.wait({close}, timeout=0.05)
+        assert not close.done()
+        disk.set()
+        await asyncio.gather(commit, close)
+    after = OrderStore(hass, "bus")
+    await after.async_load()
+    assert after.get(ABL) == lower

@@ -6,6 +6,7 @@ bus. A lowering is on disk before it is sent; a raise is written soon after the
 charger has confirmed it, since losing one only means a lower limit.
 """
 
+import asyncio
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, override
@@ -55,6 +56,7 @@ class OrderStore:
         self._orders: dict[str, Orders] = {}
         self._supply: SupplyOrder | None = None
         self._pending = False
+        self._writing = asyncio.Lock()
 
     async def async_load(self) -> None:
         """Read the file; one that cannot be read counts as none."""
@@ -125,13 +127,19 @@ class OrderStore:
     async def async_flush(self) -> None:
         """Write now what has not been written."""
         self._pending = False
-        write = self._store.async_save(self._encoded())
-        await async_finish(self._hass, write, "evse_bus orders")
+        await async_finish(self._hass, self._async_save(), "evse_bus orders")
+
+    async def _async_save(self) -> None:
+        async with self._writing:
+            await self._store.async_save(self._encoded())
 
     async def async_close(self) -> None:
         """Leave nothing unwritten and no timer behind."""
         if self._pending:
             await self.async_flush()
+        # Whoever reads the file next must not be quicker than what is being written.
+        async with self._writing:
+            pass
 
     async def async_remove(self) -> None:
         """Delete the file."""
