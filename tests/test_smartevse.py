@@ -232,6 +232,34 @@ async def test_a_setting_is_written_once(hass: HomeAssistant) -> None:
 
 
 @pytest.mark.usefixtures("all_entities_enabled")
+async def test_minimum_and_maximum_do_not_cross(hass: HomeAssistant) -> None:
+    box = SmartEvse(max_current=10, settings={"min_current": 8})
+    async with running(hass, box) as (entry, _):
+        lowest = await get_entity(hass, "number", entry, "setting_minimum_current")
+        highest = await get_entity(hass, "number", entry, "setting_maximum_current")
+        for entity, wrong in ((lowest, 11), (highest, 7)):
+            with pytest.raises(ServiceValidationError):
+                await call(hass, "number.set_value", entity, value=wrong)
+        assert not box.eeprom_writes
+        await call(hass, "number.set_value", lowest, value=10)
+        assert state_of(hass, lowest) == "10"
+
+
+@pytest.mark.usefixtures("all_entities_enabled")
+async def test_minimum_above_the_maximum_can_be_put_right(hass: HomeAssistant) -> None:
+    """Somebody has set that at the box: no car can charge, and the error says so."""
+    box = SmartEvse(max_current=10, settings={"min_current": 14})
+    async with running(hass, box) as (entry, _):
+        limit = await get_entity(hass, "number", entry, "charging_current")
+        lowest = await get_entity(hass, "number", entry, "setting_minimum_current")
+        with pytest.raises(ServiceValidationError, match="below the minimum 14 A"):
+            await call(hass, "number.set_value", limit, value=10)
+        await call(hass, "number.set_value", lowest, value=6)
+        await call(hass, "number.set_value", limit, value=10)
+        assert state_of(hass, limit) == "10.0"
+
+
+@pytest.mark.usefixtures("all_entities_enabled")
 async def test_signed_settings(
     hass: HomeAssistant, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -124,7 +124,9 @@ NUMBERS: Final[tuple[OrderNumberDescription, ...]] = (
         translation_key="charging_current",
         value=lambda orders, limits: min(orders.limit.current, ceiling(limits)),
         change=lambda value: OrderChange(current=value),
-        lowest=lambda limits: limits.minimum,
+        # A box whose own minimum is above all that it may offer has no range; what is
+        # ordered is refused with the reason.
+        lowest=lambda limits: min(limits.minimum, ceiling(limits)),
         **_CURRENT,
     ),
     *(_phase_limit(index) for index in range(3)),
