@@ -6,7 +6,7 @@ NO_COMM. So all that is to be said goes in one burst, and then there is quiet. O
 pause does not wait for its end. PROTOCOLS.md, 3.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import ClassVar, Final, override
@@ -14,7 +14,7 @@ from typing import ClassVar, Final, override
 from ..errors import LineBusyError, SharedAddressError
 from ..exchange import Request, Talk
 from ..jobs import Later, Step
-from ..model import ChargerConfig, Fault, Orders, Persistence
+from ..model import ChargerConfig, Fault, Orders, Persistence, Range, Setting
 from ..schedule import Kind
 from ..turns import Turns, in_turns
 from .box import SmartEvseBox
@@ -41,6 +41,24 @@ class PolledBox(SmartEvseBox):
         self._last_request = 0.0
         self.leaves = False
         """It was stopped for good: Home Assistant goes."""
+
+    # -- What it keeps in its memory -------------------------------------------------
+
+    @property
+    @override
+    def settings(self) -> Mapping[Setting, Range]:
+        ranges = dict(super().settings)
+        if self.configuration is None or not ranges:
+            return ranges
+        # With a minimum above the maximum no car could charge at all.
+        told = self.configuration.settings
+        own = ranges[Setting.MAXIMUM_CURRENT]
+        least = min(max(own.minimum, told[Setting.MINIMUM_CURRENT]), own.maximum)
+        ranges[Setting.MAXIMUM_CURRENT] = replace(own, minimum=least)
+        own = ranges[Setting.MINIMUM_CURRENT]
+        most = max(min(own.maximum, told[Setting.MAXIMUM_CURRENT]), own.minimum)
+        ranges[Setting.MINIMUM_CURRENT] = replace(own, maximum=most)
+        return ranges
 
     # -- When ------------------------------------------------------------------------
 
