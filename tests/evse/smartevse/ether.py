@@ -83,6 +83,7 @@ class Ether(Line):
         self.sent: list[Sent] = []
         self.refuse_open: Exception | None = None
         self.busy_until = 0.0
+        self.on_sent: Callable[[Sent], None] = lambda _sent: None
         self._open = False
         self._lost_until = 0.0
 
@@ -112,6 +113,7 @@ class Ether(Line):
             raise LineLostError("not open")
         begin, end = now(), now() + len(data) * BYTE
         self.sent.append(Sent(begin, data))
+        self.on_sent(self.sent[-1])
         self.last_activity = end
         if begin < self.busy_until:
             # It meets what somebody else is saying.
@@ -188,9 +190,12 @@ class MasterScene:
     """Most that all boxes have offered at one moment, A."""
     overshoot: float = field(init=False, default=0.0)
     """By how much that was above the limit at worst, A."""
+    said: float = field(init=False, default=0.0)
+    """By how much the words of one broadcast were above it at worst, 0.1 A."""
 
     def __post_init__(self) -> None:
         self.line = Ether()
+        self.line.on_sent = self._add_up
         self.new_bus()
         self._life: asyncio.Task[None] | None = None
         for unit in self.units:
@@ -271,6 +276,13 @@ class MasterScene:
             self.box(unit).car.plug_in()
         await self.until(lambda: all(self.box(u).state == "C" for u in units))
 
+    def _add_up(self, sent: Sent) -> None:
+        if sent.is_broadcast:
+            # A box that nobody can reach is told 6 A, whatever there is.
+            lowest = 60 * sum(word > 0 for word in sent.words)
+            limit = max(self.master.supply.limit * 10, lowest)
+            self.said = max(self.said, sum(sent.words) - limit)
+
     async def _live(self) -> None:
         while True:
             self.line.live()
@@ -291,5 +303,7 @@ class MasterScene:
             self._life.cancel()
             with suppress(asyncio.CancelledError):
                 await self._life
+        if exc[0] is None:
+            assert self.said <= 0, f"{self.said / 10:g} A too many in one broadcast"
         if exc[0] is None and self.watch:
             assert self.overshoot <= 1e-6, f"{self.overshoot:g} A above the supply"

@@ -228,7 +228,8 @@ def test_the_last_come_is_stopped_where_the_supply_does_not_suffice() -> None:
             lowered = now()
             await asyncio.sleep(0.6)
             assert scene.box(4).state == "A"
-            assert scene.offers == 13
+            # No more than the lowest, as long as the third one had not stopped.
+            assert 12 <= scene.offers <= 13
             scene.overshoot = 0.0
             await asyncio.sleep(3)
             assert scene.offers == 13

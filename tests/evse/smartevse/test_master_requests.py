@@ -173,7 +173,9 @@ def test_room_is_made_first_and_well_within_the_second() -> None:
                 "020400a0",
                 "03060083",
             ]
-            assert sent[lowered + 2].data[4:6] == (80).to_bytes(2, "big")
+            # The lowest at first: it was told nothing as long as it drew nothing.
+            assert sent[lowered + 2].data[4:6] == (60).to_bytes(2, "big")
+            await scene.until(lambda: scene.box(3).offers == 8, 5)
 
     simulate(scene())
 

@@ -16,6 +16,7 @@ from custom_components.evse_bus.evse.smartevse.sharing import (
     next_values,
     offered,
     split,
+    together,
 )
 
 
@@ -48,6 +49,52 @@ def test_split(
     limit: int, minimum: int, wishes: tuple[int, ...], shares: tuple[int, ...]
 ) -> None:
     assert tuple(split(limit, minimum, claims(*wishes)).values()) == shares
+
+
+@pytest.mark.parametrize(
+    ("limit", "values", "active", "said"),
+    [
+        # One charges with all there is: the other is told nothing until it asks.
+        (160, (160, 160), (2,), (160, 0)),
+        (200, (160, 100), (2,), (160, 0)),
+        (320, (160, 100), (2,), (160, 100)),
+        # Nobody charges: none is told more than its part.
+        (160, (160, 160), (), (80, 80)),
+        (160, (160, 160, 160), (), (0, 0, 0)),
+        (160, (160,), (), (160,)),
+        # The second is being stopped, and offers 6 A until it has heard so.
+        (130, (70, 60, 0), (2, 3, 4), (60, 60, 0)),
+        (80, (80, 0), (2, 3), (60, 0)),
+    ],
+)
+def test_together(
+    limit: int,
+    values: tuple[int, ...],
+    active: tuple[int, ...],
+    said: tuple[int, ...],
+) -> None:
+    by_unit = dict(enumerate(values, 2))
+    assert tuple(together(limit, by_unit, active).values()) == said
+
+
+@given(
+    limit=st.integers(0, 900),
+    minimum=st.integers(60, 160),
+    wishes=st.lists(st.integers(0, 800), min_size=1, max_size=3),
+    idle=st.lists(st.integers(60, 800), max_size=2),
+)
+def test_what_is_said_together_is_never_above_the_limit(
+    limit: int, minimum: int, wishes: list[int], idle: list[int]
+) -> None:
+    shares = split(limit, minimum, claims(*wishes))
+    values = shares | dict(enumerate(idle, 10))
+    said = together(limit, values, shares)
+    assert sum(said.values()) <= limit
+    assert all(said[unit] <= value for unit, value in values.items())
+    assert all(value == 0 or value >= LOWEST for value in said.values())
+    if len(shares) * LOWEST <= limit and all(shares.values()):
+        # Nothing is taken from those who draw where there is enough.
+        assert {unit: said[unit] for unit in shares} == shares
 
 
 def test_what_nobody_can_stop_has_its_6_a_before_all() -> None:

@@ -59,6 +59,8 @@ from .timing import (
     TIMING,
 )
 
+_SOONER: Final = 1.0
+"""A slow poll comes so much before the deadline, s."""
 NOT_UNDERSTOOD: Final = 3
 """Answers in a row that cannot be, until nothing said before counts any more."""
 
@@ -176,8 +178,8 @@ class EwsPort(Charger):
         deadline = self.box.heard_at + COMMAND_TIMEOUT - COMMAND_MARGIN
         slot.start_by = inf
         if self._leads and deadline > now:
-            slot.ready = min(slot.ready, deadline)
-            slot.due = min(slot.due, deadline)
+            slot.ready = min(slot.ready, deadline - _SOONER)
+            slot.due = min(slot.due, deadline - _SOONER)
             slot.start_by = deadline
 
     @property
@@ -185,11 +187,10 @@ class EwsPort(Charger):
         bus = self.bus
         return bus is not None and next(iter(bus.chargers.values()), None) is self
 
-    def hurry(self) -> None:
-        """Poll as soon as the bus is free."""
-        now = -inf if self.bus is None else self.bus.now
-        self.slot.ready = min(self.slot.ready, now)
-        self.slot.due = min(self.slot.due, now)
+    def hurry(self, at: float = -inf) -> None:
+        """Poll as soon as the bus is free, but not before a loop time."""
+        self.slot.ready = min(self.slot.ready, at)
+        self.slot.due = min(self.slot.due, at)
         if self.bus is not None:
             self.bus.look_again()
 
@@ -415,15 +416,15 @@ class EwsPort(Charger):
             return None
         # The first port that is asked hears it for both.
         self.box.hear(info)
-        for other in self.bus.chargers.values():
-            if isinstance(other, EwsPort):
-                other.hurry()
-        now = self.bus.now
         if self._urgent_waits:
             return Later(0.0, _nothing)
         self._urgent_waits = True
+        now = self.bus.now
         pause = max(0.0, self._urgent_at + INFO_PAUSE - now)
         self._urgent_at = now + pause
+        for other in self.bus.chargers.values():
+            if isinstance(other, EwsPort):
+                other.hurry(self._urgent_at)
         return Later(pause, self._urgent)
 
     async def _urgent(self, talk: Talk) -> Later[None] | None:

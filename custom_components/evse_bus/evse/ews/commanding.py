@@ -130,5 +130,4 @@ async def _reset(port: EwsPort, talk: Talk) -> Turns:
         await box.ask(talk, CommandId.RESET, reset, decode_reset)
     except ReplyTimeoutError as error:
         raise NotConfirmedError(str(error)) from error
-    # It is another one now, as far as anybody can know.
-    box.doubt()
+    box.was_reset()

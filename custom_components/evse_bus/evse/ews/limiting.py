@@ -128,9 +128,8 @@ class Limiter:
                     yield READY_PAUSE
                     continue
                 yield 0.0
-                async for pause in self._at_least_lowest(talk):
+                async for pause in self._after_refusal(talk):
                     yield pause
-                port.tell(Fault.LIMIT_NOT_TAKEN, present=True)
                 raise
             yield 0.0
             for _ in range(LOOKS):
@@ -178,15 +177,19 @@ class Limiter:
         port.tell(Fault.LIMIT_NOT_TAKEN, present=False)
         return True
 
-    async def _at_least_lowest(self, talk: Talk) -> Turns:
-        """Say 6 A to a box that refused, and stands above the order."""
+    async def _after_refusal(self, talk: Talk) -> Turns:
+        """Leave a box that refused at no more than was ordered: at 6 A, if need be."""
         port = self._port
-        wanted = self.wanted(port.effective_orders)
-        if wanted is None or self._is_taken(int(wanted.current)):
-            return
         async for pause in port.ready(talk):
             yield pause
-        try:
-            await self._say(talk, lambda: _LOWEST)
-        except EwsRefusedError:
+        wanted = self.wanted(port.effective_orders)
+        told = self.told
+        if wanted is None or told is None:
             return
+        if self._is_taken(int(wanted.current)):
+            # It has a lower maximum than it tells: said again, it would refuse again.
+            self._other = (int(wanted.current), told)
+            return
+        port.tell(Fault.LIMIT_NOT_TAKEN, present=True)
+        with suppress(EwsRefusedError):
+            await self._say(talk, lambda: _LOWEST)

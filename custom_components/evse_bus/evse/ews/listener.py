@@ -320,9 +320,10 @@ def _ask_now(bus: Bus) -> None:
 
 
 def _error(error: Exception) -> LineError:
-    code = error.errno if isinstance(error, OSError) else None
+    code = getattr(error, "errno", None)
     if code == errno.EADDRINUSE:
         return PortBusyError(str(error))
-    if code == errno.EADDRNOTAVAIL or isinstance(error, OverflowError):
+    # None of a host's addresses being ours comes without a code.
+    if code in (errno.EADDRNOTAVAIL, None):
         return PortMissingError(str(error))
     return line_error(error)

@@ -176,6 +176,11 @@ class EwsBox:
         self._answers = self._known = False
         self.ports_at = -inf
 
+    def was_reset(self) -> None:
+        """Note that it restarts: it is another box now, as far as anybody can know."""
+        self._flagged = False
+        self.doubt()
+
     def _note(self, talk: Talk) -> None:
         if talk.sent_at is not None:
             self.heard_at = talk.sent_at

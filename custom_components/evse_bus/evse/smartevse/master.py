@@ -23,6 +23,7 @@ from ..model import Fault, Supply
 from .balancing import CURRENTS, broadcast, decode_request, is_foreign_broadcast
 from .registers import LONGEST_REQUEST, tenths
 from .sharing import (
+    LOWEST,
     STOPS_ALONE,
     Claim,
     Draw,
@@ -31,6 +32,7 @@ from .sharing import (
     in_the_way,
     next_values,
     split,
+    together,
 )
 
 if TYPE_CHECKING:
@@ -167,8 +169,7 @@ class Master(Duty):
         idle: list[Claim] = []
         for unit, slave in slaves.items():
             claim = slave.claim(now, may_draw=draws[unit].may_draw)
-            active = draws[unit].may_draw or slave.is_promised(now)
-            (claims if active else idle).append(claim)
+            (claims if self._is_active(slave, now) else idle).append(claim)
         minimum = round(self._supply.minimum * 10)
         shares = split(self._limit, minimum, claims)
         for claim in idle:
@@ -178,7 +179,22 @@ class Master(Duty):
         return {unit: shares[unit] for unit in slaves}
 
     def _values(self, now: float) -> dict[int, int]:
-        return next_values(self._limit, self.shares(), self._all_draws(), now)
+        draws = self._all_draws()
+        values = next_values(self._limit, self.shares(), draws, now)
+        gone = (draw.most(now) for unit, draw in draws.items() if unit not in values)
+        taken = sum(LOWEST for most in gone if most > 0)
+        active = [
+            slave.unit
+            for slave in self.slaves
+            if self._is_active(slave, now)
+            # Who draws nothing and may have nothing takes nothing from the others.
+            and (values.get(slave.unit) or self.draw(slave.unit).may_draw)
+        ]
+        return together(self._limit - taken, values, active)
+
+    def _is_active(self, slave: Member, now: float) -> bool:
+        """Return whether a slave may draw current, or is about to."""
+        return self.draw(slave.unit).may_draw or slave.is_promised(now)
 
     def in_the_way(self, unit: int) -> list[Member]:
         """Return the slaves that must go down first before this one may begin."""

@@ -203,6 +203,31 @@ def next_values(
     return values
 
 
+def together(
+    limit: int, values: Mapping[int, int], active: Iterable[int]
+) -> dict[int, int]:
+    """Return the values with which one broadcast keeps to the limit, 0.1 A.
+
+    The ``active`` draw, or are about to. Where they would offer too much, because one
+    is still being stopped, the others go down to the lowest meanwhile. What they leave
+    goes in equal parts to boxes that draw nothing: nobody who adds up the values of
+    a broadcast shall find more than there is.
+    """
+    active = [unit for unit in values if unit in set(active)]
+    said = dict(values)
+    left = limit - sum(offered(said[unit]) for unit in active)
+    for unit in active:
+        less = min(max(-left, 0), max(said[unit] - LOWEST, 0))
+        said[unit] -= less
+        left += less
+    idle = [unit for unit in values if unit not in active]
+    part = max(left, 0) // max(len(idle), 1)
+    for unit in idle:
+        value = min(said[unit], part)
+        said[unit] = value if value >= LOWEST else 0
+    return said
+
+
 def grant(
     limit: int, share: int, unit: int, draws: Mapping[int, Draw], now: float
 ) -> int:
