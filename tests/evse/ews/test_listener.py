@@ -1,0 +1,454 @@
+"""Boxes that dial us: who gets a bus, who does not, and what strangers can do."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from ipaddress import ip_network
+import socket
+import time
+
+import pytest
+
+from custom_components.evse_bus.evse.bus import Bus
+from custom_components.evse_bus.evse.errors import (
+    NotAvailableError,
+    PortBusyError,
+    PortMissingError,
+)
+from custom_components.evse_bus.evse.ews import accepted, listener as listening
+from custom_components.evse_bus.evse.ews.charger import EwsPort
+from custom_components.evse_bus.evse.ews.config import EwsPortConfig
+from custom_components.evse_bus.evse.ews.listener import Listener, Stranger
+from custom_components.evse_bus.evse.model import CurrentLimit, OrderChange, Orders
+from tests.virtual import Car
+from tests.virtual.ews_box import EwsBox as VirtualBox
+from tests.virtual.ews_cli import EwsFleet
+from tests.virtual.ews_dialler import EwsDialler
+
+pytestmark = pytest.mark.usefixtures("socket_enabled")
+
+SERIAL = "012345678901"
+RETRY = 0.05
+HOST = "127.0.0.1"
+
+
+def run(scene: Callable[[], object]) -> None:
+    asyncio.run(scene())  # type: ignore[arg-type]
+
+
+async def until(what: Callable[[], object], patience: float = 8.0) -> None:
+    end = time.monotonic() + patience
+    while not what():
+        assert time.monotonic() < end, "it never happened"
+        await asyncio.sleep(0.01)
+
+
+@asynccontextmanager
+async def server(**options: object) -> AsyncIterator[Listener]:
+    made = Listener(HOST, 0, **options)  # type: ignore[arg-type]
+    await made.start()
+    try:
+        yield made
+    finally:
+        await made.stop()
+
+
+@asynccontextmanager
+async def expected(
+    made: Listener, serial: str = SERIAL, ports: tuple[int, ...] = (1, 2)
+) -> AsyncIterator[Bus]:
+    bus = made.expect(serial)
+    for port in ports:
+        bus.add(
+            EwsPort(
+                EwsPortConfig(
+                    key=f"{serial}-{port}",
+                    name=f"{serial} {port}",
+                    address=port,
+                    serial=serial,
+                    installation_limit=16.0,
+                    poll_interval=0.5,
+                ),
+                Orders(limit=CurrentLimit(current=16.0)),
+            )
+        )
+    await bus.start()
+    try:
+        yield bus
+    finally:
+        await made.forget(serial)
+
+
+@contextmanager
+def dialling(made: Listener, box: VirtualBox | None = None) -> Iterator[EwsDialler]:
+    with EwsDialler(
+        box or VirtualBox(serial=SERIAL), HOST, made.port, retry=RETRY, source_ports=0
+    ) as dialler:
+        yield dialler
+
+
+def first(bus: Bus) -> EwsPort:
+    port = next(iter(bus.chargers.values()))
+    assert isinstance(port, EwsPort)
+    return port
+
+
+def has_reading(bus: Bus) -> bool:
+    return all(one.available and one.reading for one in bus.chargers.values())
+
+
+def test_nobody_has_dialled_yet_and_all_is_well() -> None:
+    async def scene() -> None:
+        async with server() as made, expected(made) as bus:
+            await asyncio.sleep(0.1)
+            assert made.is_listening
+            assert not bus.connected
+            assert not first(bus).available
+            with pytest.raises(Exception, match="not connected"):
+                await first(bus).change_orders(OrderChange(current=10.0))
+
+    run(scene)
+
+
+def test_a_box_dials_and_charges() -> None:
+    async def scene() -> None:
+        car = Car()
+        box = VirtualBox(serial=SERIAL, cars=(car,))
+        async with server() as made, expected(made) as bus:
+            with dialling(made, box) as dialler:
+                await until(lambda: has_reading(bus))
+                assert bus.wire.statistics.reopened == 0
+                await until(lambda: box.ports[0].limit == box.ports[1].limit == 16)
+                car.plug_in()
+                await until(
+                    lambda: first(bus).reading.connectors[1].raw_state == "0x30"  # type: ignore[union-attr]
+                )
+                await first(bus).change_orders(OrderChange(allowed=True, current=10.0))
+                await until(lambda: box.ports[0].contactor)
+                assert box.ports[0].offered == 10
+                assert not dialler.dropped
+
+    run(scene)
+
+
+def test_a_stranger_is_told_of_and_gets_nothing_but_its_identification() -> None:
+    async def scene() -> None:
+        told: list[Stranger] = []
+        box = VirtualBox(serial="099999999999")
+        async with server(on_stranger=told.append) as made:
+            with dialling(made, box):
+                await until(lambda: told)
+                await asyncio.sleep(0.3)
+                assert told[0].serial == "099999999999"
+                assert str(told[0].peer) == HOST
+                assert {one.name for one in box.commands} == {"id", "rs"}
+                async with expected(made, "099999999999") as bus:
+                    # Set up meanwhile: the connection that is there is taken.
+                    await until(lambda: has_reading(bus))
+                    assert made.statistics.accepted == 1
+
+    run(scene)
+
+
+def test_the_other_reading_of_the_checksum(monkeypatch: pytest.MonkeyPatch) -> None:
+    quick = listening.TCP_TIMING
+    monkeypatch.setattr(
+        listening,
+        "TCP_TIMING",
+        type(quick)(reply_timeout=0.2, gap=0.2, longest_reply=quick.longest_reply),
+    )
+
+    async def scene() -> None:
+        box = VirtualBox(serial=SERIAL, bcc="without_msgid")
+        async with server() as made, expected(made) as bus:
+            with dialling(made, box):
+                await until(lambda: has_reading(bus))
+
+    run(scene)
+
+
+def test_the_box_dials_again() -> None:
+    async def scene() -> None:
+        async with server() as made, expected(made) as bus:
+            with dialling(made) as dialler:
+                await until(lambda: has_reading(bus))
+                states: list[bool] = []
+                bus.subscribe(lambda: states.append(bus.connected))
+                dialler.hang_up()
+                await until(lambda: states == [False, True])
+                await until(lambda: has_reading(bus))
+                assert bus.wire.statistics.reopened == 1
+
+    run(scene)
+
+
+def test_a_second_connection_with_the_same_number_is_refused() -> None:
+    async def scene() -> None:
+        car = Car()
+        box = VirtualBox(serial=SERIAL, cars=(car,))
+        false = VirtualBox(serial=SERIAL)
+        async with server() as made, expected(made) as bus:
+            with dialling(made, box) as dialler:
+                await until(lambda: has_reading(bus))
+                with dialling(made, false):
+                    await until(lambda: made.statistics.seconds >= 3)
+                    assert {one.name for one in false.commands} <= {"id", "rs"}
+                    assert not dialler.dropped
+                    assert dialler.opened == 1
+                    assert has_reading(bus)
+        assert made.statistics.replaced == 0
+
+    run(scene)
+
+
+def test_a_half_open_connection_makes_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(listening, "PROOF_TIME", 1.0)
+
+    async def scene() -> None:
+        async with server() as made, expected(made) as bus:
+            with dialling(made) as dialler:
+                await until(lambda: has_reading(bus))
+                dialler.vanish()
+                await until(lambda: made.statistics.replaced == 1)
+                await until(lambda: has_reading(bus))
+                assert bus.wire.statistics.reopened == 1
+
+    run(scene)
+
+
+def test_a_half_open_connection_dies(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(accepted, "ANSWER_PATIENCE", 1.0)
+
+    async def scene() -> None:
+        async with server() as made, expected(made) as bus:
+            with dialling(made) as dialler:
+                await until(lambda: has_reading(bus))
+                dialler.vanish(redial=False)
+                await until(lambda: not bus.connected)
+                assert not first(bus).available
+                dialler.dial()
+                await until(lambda: has_reading(bus))
+
+    run(scene)
+
+
+def test_a_box_without_power(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(listening, "PROOF_TIME", 0.5)
+
+    async def scene() -> None:
+        box = VirtualBox(serial=SERIAL)
+        async with server() as made, expected(made) as bus:
+            with dialling(made, box):
+                await until(lambda: has_reading(bus))
+                await until(lambda: box.ports[0].limit == 16)
+                box.power_cycle(0.2)
+                await until(lambda: made.statistics.replaced == 1)
+                await until(lambda: box.ports[0].limit == 16)
+
+    run(scene)
+
+
+# -- People one does not want ---------------------------------------------------------
+
+
+async def goes(client: socket.socket, patience: float = 3.0) -> bool:
+    """Return whether the connection is ended by the other end."""
+    loop = asyncio.get_running_loop()
+    try:
+        async with asyncio.timeout(patience):
+            while True:
+                if not await loop.sock_recv(client, 4096):
+                    return True
+    except TimeoutError:
+        return False
+    except OSError:
+        return True
+
+
+@contextmanager
+def stranger(made: Listener) -> Iterator[socket.socket]:
+    with socket.create_connection((HOST, made.port)) as client:
+        client.setblocking(False)  # noqa: FBT003 - the call takes no keyword
+        yield client
+
+
+def test_addresses_that_may_not_connect() -> None:
+    async def scene() -> None:
+        async with server(allowed=(ip_network("192.0.2.0/24"),)) as made:
+            with stranger(made) as client:
+                assert await goes(client)
+            assert made.statistics.not_allowed == 1
+        async with (
+            server(allowed=(ip_network("127.0.0.0/8"),)) as made,
+            expected(made) as bus,
+        ):
+            with dialling(made):
+                await until(lambda: has_reading(bus))
+
+    run(scene)
+
+
+def test_silence_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(listening, "IDENTIFY_TIME", 0.5)
+
+    async def scene() -> None:
+        async with server() as made:
+            with stranger(made) as client:
+                assert await goes(client)
+            assert made.statistics.unidentified == 1
+
+    run(scene)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"GET / HTTP/1.1\r\n\r\n" * 100,
+        bytes(2000),
+        b"\x02\x04\x11Cid" + bytes(1200),
+        b"\x02\xff\xffAid" + b"\x02\x00" * 1000,
+        bytes.fromhex("02 000b 49 6966 00 0000000000000000 4d") * 1000,
+    ],
+    ids=["http", "zeros", "over-long", "longest", "records"],
+)
+def test_garbage_ends_a_connection(data: bytes) -> None:
+    async def scene() -> None:
+        async with server() as made:
+            with stranger(made) as client:
+                await asyncio.get_running_loop().sock_sendall(client, data)
+                assert await goes(client, 1.5)
+
+    run(scene)
+
+
+def test_who_sends_slowly_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(listening, "IDENTIFY_TIME", 0.5)
+
+    async def scene() -> None:
+        box = VirtualBox(serial=SERIAL)
+        async with server() as made, expected(made) as bus:
+            with dialling(made, box) as dialler:
+                dialler.pace = (1, 0.05)
+                await until(lambda: made.statistics.unidentified >= 2)
+                assert not bus.connected
+
+    run(scene)
+
+
+def test_who_says_nothing_does_not_keep_boxes_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(listening, "GRACE", 0.1)
+
+    async def scene() -> None:
+        async with server() as made, expected(made) as bus:
+            silent = [socket.create_connection((HOST, made.port)) for _ in range(40)]
+            await until(lambda: made.statistics.accepted + made.statistics.crowded_out)
+            await asyncio.sleep(0.2)
+            with dialling(made):
+                await until(lambda: has_reading(bus))
+            assert made.statistics.crowded_out > 0
+            assert len(made._unidentified) <= listening.MOST_UNIDENTIFIED
+            for one in silent:
+                one.close()
+
+    run(scene)
+
+
+def test_a_box_that_begins_to_talk_nonsense_is_hung_up_on() -> None:
+    async def scene() -> None:
+        box = VirtualBox(serial=SERIAL)
+        async with server() as made, expected(made) as bus:
+            with dialling(made, box) as dialler:
+                await until(lambda: has_reading(bus))
+                box.send_raw(b"\x55" * 3000)
+                await until(lambda: dialler.opened == 2)
+                await until(lambda: has_reading(bus))
+
+    run(scene)
+
+
+def test_what_has_happened_meanwhile_is_told() -> None:
+    """Keys that were pressed without a server come before the first question."""
+
+    async def scene() -> None:
+        box = VirtualBox(serial=SERIAL, manual_io=True)
+        async with server() as made, expected(made) as bus:
+            events: list[object] = []
+            first(bus).subscribe_events(events.append)
+            dialler = EwsDialler(box, HOST, made.port, retry=60, source_ports=0)
+            with dialler:
+                await until(lambda: has_reading(bus))
+                dialler.hang_up(redial=False)
+                await until(lambda: not bus.connected)
+                box.press_key(1, 3, 0.5)
+                await asyncio.sleep(0.7)
+                dialler.dial()
+                await until(lambda: events)
+                assert events[0].key == 3  # type: ignore[attr-defined]
+
+    run(scene)
+
+
+def test_fifty_boxes() -> None:
+    async def scene() -> None:
+        serials = [f"{n:012d}" for n in range(1, 51)]
+        boxes = [VirtualBox(serial=serial) for serial in serials]
+        async with server() as made:
+            buses = []
+            async with asyncio.TaskGroup() as group:
+                for serial in serials:
+                    bus = made.expect(serial)
+                    buses.append(bus)
+                    bus.add(
+                        EwsPort(
+                            EwsPortConfig(
+                                key=serial,
+                                name=serial,
+                                address=1,
+                                serial=serial,
+                                installation_limit=16.0,
+                            ),
+                            Orders(limit=CurrentLimit(current=16.0)),
+                        )
+                    )
+                    group.create_task(bus.start())
+            with EwsFleet(boxes, HOST, made.port, retry=0.1, source_ports=0):
+                await until(lambda: all(map(has_reading, buses)), 30)
+                await until(lambda: all(box.ports[0].limit == 16 for box in boxes), 30)
+                await asyncio.sleep(2.5)
+                assert sum(bus.wire.statistics.missed_deadlines for bus in buses) == 0
+                assert all(has_reading(bus) for bus in buses)
+            for serial in serials:
+                await made.forget(serial)
+
+    run(scene)
+
+
+def test_a_port_that_is_taken_and_an_address_that_is_not_ours() -> None:
+    async def scene() -> None:
+        async with server() as made:
+            with pytest.raises(PortBusyError):
+                await Listener(HOST, made.port).start()
+        with pytest.raises(PortMissingError):
+            await Listener("192.0.2.1", 0).start()
+
+    run(scene)
+
+
+def test_a_bus_that_is_stopped_leaves_nothing() -> None:
+    async def scene() -> None:
+        async with server() as made:
+            bus = made.expect(SERIAL)
+            await bus.start()
+            with dialling(made) as dialler:
+                await until(lambda: bus.connected)
+                await bus.stop()
+                await until(lambda: dialler.opened >= 2 or not dialler.connected)
+                with pytest.raises(NotAvailableError):
+                    await bus.run(lambda _talk: asyncio.sleep(0))  # type: ignore[arg-type, return-value]
+                await bus.start()
+                await until(lambda: bus.connected)
+            await made.forget(SERIAL)
+
+    run(scene)

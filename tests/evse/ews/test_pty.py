@@ -1,0 +1,66 @@
+"""The same conversation on a real line, with a clock that runs."""
+
+import asyncio
+import time
+
+from custom_components.evse_bus.evse.ews import PROTOCOL
+from custom_components.evse_bus.evse.ews.config import EwsPortConfig
+from custom_components.evse_bus.evse.model import (
+    CurrentLimit,
+    OrderChange,
+    Orders,
+    Status,
+)
+from tests.virtual import Car, VirtualBus
+from tests.virtual.ews_box import EwsBox as VirtualBox
+
+
+async def until(what: object, patience: float = 8.0) -> None:
+    end = time.monotonic() + patience
+    while not what():  # type: ignore[operator]
+        assert time.monotonic() < end, "it never happened"
+        await asyncio.sleep(0.01)
+
+
+def test_both_ports_on_a_pty() -> None:
+    async def scene(bus: VirtualBus, box: VirtualBox, cars: tuple[Car, Car]) -> None:
+        async with PROTOCOL.bus(bus.url) as line:
+            ports = [
+                PROTOCOL.charger(
+                    EwsPortConfig(
+                        key=str(port),
+                        name=str(port),
+                        address=port,
+                        serial=box.serial,
+                        installation_limit=16.0,
+                        poll_interval=0.3,
+                    ),
+                    Orders(limit=CurrentLimit(current=16.0)),
+                )
+                for port in (1, 2)
+            ]
+            for port in ports:
+                line.add(port)
+            await until(lambda: all(port.reading for port in ports))
+            for at, port in enumerate(ports):
+                cars[at].plug_in()
+                await until(lambda at=at: box.ports[at].status == 0x30)
+                await port.change_orders(OrderChange(allowed=True, current=10.0 + at))
+            await until(lambda: all(port.contactor for port in box.ports))
+            assert [port.offered for port in box.ports] == [10, 11]
+            await ports[1].change_orders(OrderChange(allowed=False))
+            assert [port.status for port in box.ports] == [0x40, 0x50]
+            assert all(port.locked for port in box.ports)
+            reading = ports[1].reading
+            assert reading is not None
+            assert reading.connectors[1].status is Status.SUSPENDED_EVSE
+            bus.unplug()
+            await until(lambda: not line.connected)
+            bus.replug()
+            await until(lambda: all(port.reading for port in ports))
+            assert line.wire.statistics.bad_frames == 0
+
+    cars = (Car(), Car())
+    box = VirtualBox(cars=cars)
+    with VirtualBus.pty(box) as bus:
+        asyncio.run(scene(bus, box, cars))

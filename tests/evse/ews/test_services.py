@@ -1,0 +1,268 @@
+"""Cards, meter, LEDs, parameters and firmware, on the virtual box."""
+
+import asyncio
+from datetime import UTC, datetime
+from zoneinfo import ZoneInfo
+
+import pytest
+
+from custom_components.evse_bus.evse.errors import NotConfirmedError, RefusedOrderError
+from custom_components.evse_bus.evse.ews.answers import EwsRefusedError, Refusal
+from custom_components.evse_bus.evse.ews.cards import (
+    AcceptedCard,
+    EntryKind,
+    card_entry,
+)
+from custom_components.evse_bus.evse.ews.commands import (
+    LED_ON,
+    PortLeds,
+    ReaderTarget,
+)
+from custom_components.evse_bus.evse.ews.firmware import upload
+from custom_components.evse_bus.evse.ews.parameters import (
+    EXTRA_BLOCK,
+    INSTALLATION_BLOCK,
+    SYSTEM_BLOCK,
+    USER_BLOCK,
+    SystemMode,
+)
+from custom_components.evse_bus.evse.ews.timing import TCP_TIMING
+from tests.virtual.ews_rfid import Card
+
+from .ether import EwsScene, play
+
+
+def test_a_card_is_accepted() -> None:
+    async def acts(scene: EwsScene) -> None:
+        scene.box.present_card(Card(foreign=True))
+        await asyncio.sleep(1)
+        card = AcceptedCard(group=7, number=42, user="MAX", tag=bytes(7))
+        await scene.charger().services.accept_card(card)
+        assert scene.box.reader.accepted
+        assert scene.box.reader.noted == Card(7, 42, "MAX", bytes(7))
+
+    play(EwsScene(options={"rfid": True}), acts)
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_the_card_list(*, lost: bool) -> None:
+    async def acts(scene: EwsScene) -> None:
+        services = scene.charger().services
+        before = await services.read_cards()
+        if lost:
+            scene.line.mute = lambda name: name == "sf"
+        entry = card_entry(EntryKind.CARD, 3, 4)
+        after = await services.write_cards({5: entry})
+        assert after.entries[5] == entry
+        assert after.entries[:5] == before.entries[:5]
+        assert await services.read_cards() == after
+        assert len(scene.line.named("sf")) == 1
+        with pytest.raises(RefusedOrderError):
+            await services.write_cards({64: entry})
+
+    play(EwsScene(), acts)
+
+
+def test_meter_leds_reader_and_network() -> None:
+    async def acts(scene: EwsScene) -> None:
+        services = scene.charger(2).services
+        await services.set_meter(12_345_678)
+        await scene.until(lambda: scene.connector(2).energy == 12_345_678)
+        assert scene.connector(1).energy == 0
+        await services.set_leds(PortLeds(red=LED_ON), PortLeds())
+        assert await services.card_reader(ReaderTarget.READER, 2, b"id")
+        with pytest.raises(EwsRefusedError) as told:
+            await services.card_reader(ReaderTarget.CARD, 2, b"")
+        assert told.value.reason is Refusal.CARD_READER_COMMAND
+        with pytest.raises(RefusedOrderError):
+            await services.card_reader(ReaderTarget.READER, 60, b"id")
+        assert (await services.read_dhcp()).lease == 0
+
+    play(EwsScene(options={"manual_io": True}), acts)
+
+
+def test_leds_are_refused_by_a_box_that_has_them_itself() -> None:
+    async def acts(scene: EwsScene) -> None:
+        with pytest.raises(EwsRefusedError) as told:
+            await scene.charger().services.set_leds(PortLeds(), PortLeds(red=LED_ON))
+        assert told.value.reason is Refusal.LEDS
+
+    play(EwsScene(), acts)
+
+
+def test_a_lost_answer_to_what_cannot_be_read_back_is_told() -> None:
+    async def acts(scene: EwsScene) -> None:
+        scene.line.mute = lambda name: name in ("cr", "ma")
+        with pytest.raises(NotConfirmedError):
+            await scene.charger().services.set_meter(5)
+        with pytest.raises(NotConfirmedError):
+            await scene.charger().services.accept_card(AcceptedCard(group=1, number=1))
+        assert len(scene.line.named("cr", "ma")) == 2
+
+    play(EwsScene(), acts)
+
+
+def test_the_clock_on_the_users_word() -> None:
+    async def acts(scene: EwsScene) -> None:
+        scene.charger().box.clock = lambda: datetime(2026, 1, 2, 3, 4, tzinfo=UTC)
+        await scene.charger().services.set_clock(ZoneInfo("Europe/Berlin"))
+        assert f"{scene.box.clock():%Y-%m-%d %H:%M}" == "2026-01-02 04:04"
+
+    play(EwsScene(), acts)
+
+
+# -- Parameters ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_one_parameter_is_changed_and_nothing_else(*, lost: bool) -> None:
+    async def acts(scene: EwsScene) -> None:
+        scene.box.system.admin_password = b"geheim".ljust(12, b"\0")
+        scene.box.system.card_pin = b"4711"
+        before = scene.box.system.pack("no")
+        if lost:
+            scene.line.mute = lambda name: name == "sp"
+        told = await scene.charger().services.change_parameters(
+            SYSTEM_BLOCK, {"maximum_current": 20}
+        )
+        assert told.maximum_current == 20
+        after = scene.box.system.pack("no")
+        changed = [at for at in range(len(before)) if before[at] != after[at]]
+        assert len(changed) == 1
+        assert scene.box.system.max_current == 20
+        # What is installed counts at once.
+        await scene.until(lambda: scene.charger().limits.ceiling == 20)
+
+    play(EwsScene(), acts)
+
+
+def test_all_blocks_are_read_and_changed() -> None:
+    async def acts(scene: EwsScene) -> None:
+        services = scene.charger().services
+        scene.box.user.user_password = b"geheim".ljust(12, b"\0")
+        await services.change_parameters(INSTALLATION_BLOCK, {"name": "Max"})
+        assert (await services.read_parameters(INSTALLATION_BLOCK)).name == "Max"
+        await services.change_parameters(EXTRA_BLOCK, {"maximum_current_2": 10})
+        assert (await services.read_parameters(EXTRA_BLOCK)).maximum_current_2 == 10
+        await services.change_parameters(
+            USER_BLOCK, {"zone_code": 1, "user_password": "anders"}
+        )
+        told = await services.read_parameters(USER_BLOCK)
+        assert told.zone_code == 1
+        assert "anders" not in repr(told)
+
+    play(EwsScene(), acts)
+
+
+@pytest.mark.parametrize("masking", ["zeros", "stars"])
+def test_hidden_passwords_are_not_written_back(masking: str) -> None:
+    async def acts(scene: EwsScene) -> None:
+        scene.box.system.admin_password = b"geheim".ljust(12, b"\0")
+        scene.box.system.card_pin = b"4711"
+        services = scene.charger().services
+        with pytest.raises(RefusedOrderError, match="would erase"):
+            await services.change_parameters(SYSTEM_BLOCK, {"maximum_current": 20})
+        assert not scene.line.named("sp")
+        await services.change_parameters(
+            SYSTEM_BLOCK,
+            {"maximum_current": 20, "admin_password": "neu", "card_pin": "1234"},
+        )
+        assert scene.box.system.admin_password.rstrip(b"\0") == b"neu"
+        assert scene.box.system.card_pin == b"1234"
+
+    play(EwsScene(options={"masking": masking}), acts)
+
+
+def test_system_parameters_are_refused_while_a_car_charges() -> None:
+    async def acts(scene: EwsScene) -> None:
+        scene.box.system.admin_password = b"geheim".ljust(12, b"\0")
+        scene.box.system.card_pin = b"4711"
+        await scene.charge()
+        with pytest.raises(EwsRefusedError) as told:
+            await scene.charger().services.change_parameters(
+                SYSTEM_BLOCK, {"maximum_current": 20}
+            )
+        assert told.value.reason is Refusal.SYSTEM_PARAMETERS
+        assert scene.status() == 0x40
+
+    play(EwsScene(), acts)
+
+
+def test_what_the_box_keeps_as_it_was_is_told() -> None:
+    """Over the network it takes the rest, and not the server mode."""
+
+    async def acts(scene: EwsScene) -> None:
+        scene.box.system.admin_password = b"geheim".ljust(12, b"\0")
+        scene.box.system.card_pin = b"4711"
+        scene.box.network = True
+        mode = (
+            await scene.charger().services.read_parameters(SYSTEM_BLOCK)
+        ).mode ^ SystemMode.SERVER
+        with pytest.raises(NotConfirmedError, match="mode"):
+            await scene.charger().services.change_parameters(
+                SYSTEM_BLOCK, {"mode": mode}
+            )
+
+    play(EwsScene(), acts)
+
+
+# -- Firmware -----------------------------------------------------------------------
+
+
+def test_firmware_in_pieces() -> None:
+    image = bytes(range(1, 251)) * 10
+
+    async def acts(scene: EwsScene) -> None:
+        done: list[float] = []
+        await upload(scene.charger(), image, done.append)
+        assert [len(one.parameters) - 8 for one in scene.line.named("ow")] == [
+            1024,
+            1024,
+            452,
+        ]
+        assert scene.box.activated == [image]
+        assert done == [pytest.approx(n / 3) for n in (1, 2, 3)]
+        await scene.until(lambda: scene.box.restarts == 1)
+        await scene.until(lambda: scene.box.ports[0].limit == 16)
+        # Others had their turns between the pieces.
+        assert scene.bus.wire.statistics.missed_deadlines == 0
+
+    play(EwsScene(timing=TCP_TIMING), acts)
+
+
+def test_a_slow_erasure_is_waited_for() -> None:
+    async def acts(scene: EwsScene) -> None:
+        scene.line.mute = lambda _name: False
+        scene.box.faults.once("late", 8.0)
+        await upload(scene.charger(), b"\1\2\3")
+        assert scene.box.activated == [b"\1\2\3"]
+
+    async def run(scene: EwsScene) -> None:
+        # Nothing else is asked meanwhile.
+        await scene.until(lambda: scene.line.sent[-1].name == "rd")
+        await asyncio.sleep(0.1)
+        await acts(scene)
+
+    play(EwsScene(), run)
+
+
+@pytest.mark.parametrize("lost", ["oe", "ow", "fw"])
+def test_an_upload_with_a_lost_answer_ends_there(lost: str) -> None:
+    async def acts(scene: EwsScene) -> None:
+        scene.line.deaf = lambda name: name == lost
+        with pytest.raises(NotConfirmedError):
+            await upload(scene.charger(), bytes(3000))
+        assert not scene.box.activated
+        assert len(scene.line.named(lost)) == 1
+        await scene.until(lambda: scene.charger().available)
+
+    play(EwsScene(), acts)
+
+
+def test_no_image_is_no_firmware() -> None:
+    async def acts(scene: EwsScene) -> None:
+        with pytest.raises(RefusedOrderError):
+            await upload(scene.charger(), b"")
+        assert not scene.line.named("oe")
+
+    play(EwsScene(), acts)
