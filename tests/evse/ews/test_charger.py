@@ -352,9 +352,12 @@ def test_a_box_with_a_lower_maximum_than_it_tells() -> None:
     simulate(run())
 
 
+@pytest.mark.parametrize("current", [10, 20])
 @pytest.mark.parametrize("heard", [True, False])
 @pytest.mark.parametrize("name", ["st", "rd", "rc"])
-def test_a_limit_with_a_lost_answer(name: str, *, heard: bool) -> None:
+def test_a_limit_with_a_lost_answer(name: str, current: int, *, heard: bool) -> None:
+    """A lower one that is read back then is the one before."""
+
     async def acts(scene: EwsScene) -> None:
         left = 1
 
@@ -369,8 +372,8 @@ def test_a_limit_with_a_lost_answer(name: str, *, heard: bool) -> None:
             scene.line.mute = lose
         else:
             scene.line.deaf = lose
-        await scene.charger().change_orders(amperes(10.0))
-        assert scene.box.ports[0].limit == 10
+        await scene.charger().change_orders(amperes(current))
+        assert scene.box.ports[0].limit == current
 
     play(EwsScene(), acts)
 

@@ -77,7 +77,7 @@ class Run:
             self.scene.line.unplug()
 
 
-@settings(max_examples=60)
+@settings(max_examples=50)
 @given(
     acts=st.lists(ACTS, max_size=12),
     pause_status=st.sampled_from((0x50, 0x42)),

@@ -121,7 +121,7 @@ class Limiter:
                 return
             sends += 1
             try:
-                said = await self._say(talk, orders)
+                said, answered = await self._say(talk, orders)
             except EwsRefusedError:
                 if seen.status == STARTING and talk.now < patience:
                     sends -= 1
@@ -135,15 +135,18 @@ class Limiter:
             for _ in range(LOOKS):
                 async for pause in port.ready(talk):
                     yield pause
-                if said is not None and await self._is_read_back(talk, said):
+                if await self._is_read_back(talk, said, answered=answered):
                     return
                 yield LOOK_AGAIN
         port.tell(Fault.LIMIT_NOT_TAKEN, present=True)
         message = f"{port.config.name} does not follow its limit"
         raise NotConfirmedError(message)
 
-    async def _say(self, talk: Talk, orders: Callable[[], Orders]) -> int | None:
-        """Say it; return what was said, A: a lost answer may have been heard."""
+    async def _say(self, talk: Talk, orders: Callable[[], Orders]) -> tuple[int, bool]:
+        """Say it; return what was said, A, and whether that was answered.
+
+        What was not may have been heard all the same.
+        """
         port = self._port
         said: list[int] = []
 
@@ -156,11 +159,17 @@ class Limiter:
             return set_limit(port.port, setpoint)
 
         self._confirmed = self._other = None
-        with suppress(ReplyTimeoutError):
+        try:
             await port.box.tell(talk, CommandId.SET_LIMIT, request)
-        return said[-1] if said else None
+        except ReplyTimeoutError:
+            return said[-1], False
+        return said[-1], True
 
-    async def _is_read_back(self, talk: Talk, said: int) -> bool:
+    async def _is_read_back(self, talk: Talk, said: int, *, answered: bool) -> bool:
+        """Return whether the box offers that, or less because it cannot offer more.
+
+        A lower one after a lost answer is the one before: to be said again.
+        """
         port = self._port
         try:
             await port.box.look(talk)
@@ -171,6 +180,8 @@ class Limiter:
         port.take()
         told = self.told
         if told is None or not self._is_taken(said):
+            return False
+        if not answered and told != said:
             return False
         self._confirmed = said
         self._other = (said, told)
