@@ -239,7 +239,7 @@ async def test_without_supply_they_wait_and_are_still_allowed(
         status = entity_id(hass, "sensor", entry, "1_status")
         await call(hass, "number.set_value", supply, value=5)
         await bus.wait_for_async(lambda: not any(box.contactor for box in boxes))
-        await wait_for_state(hass, status, "unavailable")
+        await wait_for_state(hass, status, "suspended_evse")
         assert not any(box.access for box in boxes)
         assert (state_of(hass, one), state_of(hass, two)) == ("on", "on")
         problem = entity_id(hass, "binary_sensor", entry, "problem")

@@ -5,7 +5,13 @@ import asyncio
 import pytest
 
 from custom_components.evse_bus.evse.errors import NotConfirmedError
-from custom_components.evse_bus.evse.model import Fault, OrderChange, Setting, Supply
+from custom_components.evse_bus.evse.model import (
+    Fault,
+    OrderChange,
+    Setting,
+    Status,
+    Supply,
+)
 from custom_components.evse_bus.evse.smartevse.member import GIVE_BACK
 from tests.evse.simulated import now, simulate
 from tests.evse.smartevse.ether import MasterScene
@@ -233,6 +239,11 @@ def test_the_last_come_is_stopped_where_the_supply_does_not_suffice() -> None:
             scene.overshoot = 0.0
             await asyncio.sleep(3)
             assert scene.offers == 13
+            # It is not out of service: it waits for us.
+            waiting = scene.slave(4)
+            assert waiting.waits_for_current
+            assert waiting.reading is not None
+            assert waiting.reading.connectors[1].status is Status.SUSPENDED_EVSE
             # Room at once, but it does not flap.
             await scene.master.change_supply(Supply(limit=18.0))
             back = await scene.until(lambda: scene.box(4).state == "C", 100)

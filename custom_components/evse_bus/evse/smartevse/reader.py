@@ -259,6 +259,7 @@ class SmartEvseReader(Charger):
             status,
             self.configuration,
             plug_told=now >= self._plug_doubted_until,
+            waits=self.waits_for_current,
         )
         if reading != self.reading:
             self.reading = reading

@@ -8,6 +8,7 @@ from ..model import (
     ChargerReading,
     ConnectorReading,
     Setting,
+    Status as Word,
 )
 from .dialects import MAPS, Dialect
 from .registers import Configuration, Status
@@ -56,11 +57,13 @@ def charger_reading(
     configuration: Configuration | None,
     *,
     plug_told: bool,
+    waits: bool = False,
 ) -> ChargerReading:
     """Return what a status tells.
 
     ``plug_told``: no access and no error has just hidden a plugged car; without it
-    ``A`` is not taken for "unplugged".
+    ``A`` is not taken for "unplugged". ``waits``: it was allowed to charge, and has no
+    access because we have no current for it.
     """
     state = state_of(dialect, status.raw_state)
     hidden = status.raw_state == UNPLUGGED and not (
@@ -69,8 +72,11 @@ def charger_reading(
     settings = configuration.settings if configuration is not None else {}
     maxima = (status.maximum, settings.get(Setting.MAXIMUM_CURRENT))
     minimum = status.minimum or settings.get(Setting.MINIMUM_CURRENT)
+    word = word_of(dialect, status)
+    if word is Word.UNAVAILABLE and waits:
+        word = Word.SUSPENDED_EVSE
     connector = ConnectorReading(
-        status=word_of(dialect, status),
+        status=word,
         raw_state=status.raw_state,
         plugged=None if hidden else state.plugged,
         charging=state.charging,
