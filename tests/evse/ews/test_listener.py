@@ -1,15 +1,9 @@
-"""Boxes that dial us: who gets a bus, who does not, and what strangers can do."""
+"""Boxes that dial us, and the bus that is theirs."""
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager, contextmanager
-from ipaddress import ip_network
-import socket
-import time
 
 import pytest
 
-from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.errors import (
     NotAvailableError,
     PortBusyError,
@@ -25,76 +19,19 @@ from tests.virtual.ews_box import EwsBox as VirtualBox
 from tests.virtual.ews_cli import EwsFleet
 from tests.virtual.ews_dialler import EwsDialler
 
+from .dialling import (
+    HOST,
+    SERIAL,
+    dialling,
+    expected,
+    first,
+    has_reading,
+    run,
+    server,
+    until,
+)
+
 pytestmark = pytest.mark.usefixtures("socket_enabled")
-
-SERIAL = "012345678901"
-RETRY = 0.05
-HOST = "127.0.0.1"
-
-
-def run(scene: Callable[[], object]) -> None:
-    asyncio.run(scene())  # type: ignore[arg-type]
-
-
-async def until(what: Callable[[], object], patience: float = 8.0) -> None:
-    end = time.monotonic() + patience
-    while not what():
-        assert time.monotonic() < end, "it never happened"
-        await asyncio.sleep(0.01)
-
-
-@asynccontextmanager
-async def server(**options: object) -> AsyncIterator[Listener]:
-    made = Listener(HOST, 0, **options)  # type: ignore[arg-type]
-    await made.start()
-    try:
-        yield made
-    finally:
-        await made.stop()
-
-
-@asynccontextmanager
-async def expected(
-    made: Listener, serial: str = SERIAL, ports: tuple[int, ...] = (1, 2)
-) -> AsyncIterator[Bus]:
-    bus = made.expect(serial)
-    for port in ports:
-        bus.add(
-            EwsPort(
-                EwsPortConfig(
-                    key=f"{serial}-{port}",
-                    name=f"{serial} {port}",
-                    address=port,
-                    serial=serial,
-                    installation_limit=16.0,
-                    poll_interval=0.5,
-                ),
-                Orders(limit=CurrentLimit(current=16.0)),
-            )
-        )
-    await bus.start()
-    try:
-        yield bus
-    finally:
-        await made.forget(serial)
-
-
-@contextmanager
-def dialling(made: Listener, box: VirtualBox | None = None) -> Iterator[EwsDialler]:
-    with EwsDialler(
-        box or VirtualBox(serial=SERIAL), HOST, made.port, retry=RETRY, source_ports=0
-    ) as dialler:
-        yield dialler
-
-
-def first(bus: Bus) -> EwsPort:
-    port = next(iter(bus.chargers.values()))
-    assert isinstance(port, EwsPort)
-    return port
-
-
-def has_reading(bus: Bus) -> bool:
-    return all(one.available and one.reading for one in bus.chargers.values())
 
 
 def test_nobody_has_dialled_yet_and_all_is_well() -> None:
@@ -244,113 +181,6 @@ def test_a_box_without_power(monkeypatch: pytest.MonkeyPatch) -> None:
                 box.power_cycle(0.2)
                 await until(lambda: made.statistics.replaced == 1)
                 await until(lambda: box.ports[0].limit == 16)
-
-    run(scene)
-
-
-# -- People one does not want ---------------------------------------------------------
-
-
-async def goes(client: socket.socket, patience: float = 3.0) -> bool:
-    """Return whether the connection is ended by the other end."""
-    loop = asyncio.get_running_loop()
-    try:
-        async with asyncio.timeout(patience):
-            while True:
-                if not await loop.sock_recv(client, 4096):
-                    return True
-    except TimeoutError:
-        return False
-    except OSError:
-        return True
-
-
-@contextmanager
-def stranger(made: Listener) -> Iterator[socket.socket]:
-    with socket.create_connection((HOST, made.port)) as client:
-        client.setblocking(False)  # noqa: FBT003 - the call takes no keyword
-        yield client
-
-
-def test_addresses_that_may_not_connect() -> None:
-    async def scene() -> None:
-        async with server(allowed=(ip_network("192.0.2.0/24"),)) as made:
-            with stranger(made) as client:
-                assert await goes(client)
-            assert made.statistics.not_allowed == 1
-        async with (
-            server(allowed=(ip_network("127.0.0.0/8"),)) as made,
-            expected(made) as bus,
-        ):
-            with dialling(made):
-                await until(lambda: has_reading(bus))
-
-    run(scene)
-
-
-def test_silence_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(listening, "IDENTIFY_TIME", 0.5)
-
-    async def scene() -> None:
-        async with server() as made:
-            with stranger(made) as client:
-                assert await goes(client)
-            assert made.statistics.unidentified == 1
-
-    run(scene)
-
-
-@pytest.mark.parametrize(
-    "data",
-    [
-        b"GET / HTTP/1.1\r\n\r\n" * 100,
-        bytes(2000),
-        b"\x02\x04\x11Cid" + bytes(1200),
-        b"\x02\xff\xffAid" + b"\x02\x00" * 1000,
-        bytes.fromhex("02 000b 49 6966 00 0000000000000000 4d") * 1000,
-    ],
-    ids=["http", "zeros", "over-long", "longest", "records"],
-)
-def test_garbage_ends_a_connection(data: bytes) -> None:
-    async def scene() -> None:
-        async with server() as made:
-            with stranger(made) as client:
-                await asyncio.get_running_loop().sock_sendall(client, data)
-                assert await goes(client, 1.5)
-
-    run(scene)
-
-
-def test_who_sends_slowly_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(listening, "IDENTIFY_TIME", 0.5)
-
-    async def scene() -> None:
-        box = VirtualBox(serial=SERIAL)
-        async with server() as made, expected(made) as bus:
-            with dialling(made, box) as dialler:
-                dialler.pace = (1, 0.05)
-                await until(lambda: made.statistics.unidentified >= 2)
-                assert not bus.connected
-
-    run(scene)
-
-
-def test_who_says_nothing_does_not_keep_boxes_out(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(listening, "GRACE", 0.1)
-
-    async def scene() -> None:
-        async with server() as made, expected(made) as bus:
-            silent = [socket.create_connection((HOST, made.port)) for _ in range(40)]
-            await until(lambda: made.statistics.accepted + made.statistics.crowded_out)
-            await asyncio.sleep(0.2)
-            with dialling(made):
-                await until(lambda: has_reading(bus))
-            assert made.statistics.crowded_out > 0
-            assert len(made._unidentified) <= listening.MOST_UNIDENTIFIED
-            for one in silent:
-                one.close()
 
     run(scene)
 

@@ -21,7 +21,7 @@ from .states import STARTING
 from .timing import LOOK_AGAIN, READY_PATIENCE, READY_PAUSE
 
 if TYPE_CHECKING:
-    from .charger import EwsPort
+    from .reader import EwsReader
 
 SENDS: Final = 2
 """How often a limit is said until it must be read back."""
@@ -33,7 +33,7 @@ _LOWEST: Final = Orders(limit=CurrentLimit(current=MINIMUM_CURRENT))
 class Limiter:
     """The limit of one port."""
 
-    def __init__(self, port: EwsPort) -> None:
+    def __init__(self, port: EwsReader) -> None:
         """Take the port."""
         self._port = port
         self._confirmed: int | None = None
@@ -107,7 +107,7 @@ class Limiter:
         """Say the limit until it is read back, at it or below it.
 
         Raises NotConfirmedError when the box does not follow, EwsRefusedError when it
-        says so, and what `EwsPort.look` raises.
+        says so, and what `EwsReader.look` raises.
         """
         port = self._port
         patience = talk.now + READY_PATIENCE

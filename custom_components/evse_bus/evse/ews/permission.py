@@ -40,7 +40,7 @@ from .status import PortStatus, StartRelease
 from .timing import LOOK_AGAIN, READY_PATIENCE, READY_PAUSE, SETTLING
 
 if TYPE_CHECKING:
-    from .charger import EwsPort
+    from .reader import EwsReader
 
 SENDS: Final = 2
 """How often one order is said at most in one conversation."""
@@ -49,7 +49,7 @@ _NOTHING_TO_START: Final = (FREE, SEARCHING, ENDED, ABORTED, BLOCKED)
 """No car waits for a start: permission is given, and there is nothing to say."""
 
 
-def _may_have_paused(port: EwsPort) -> bool:
+def _may_have_paused(port: EwsReader) -> bool:
     orders = [port.orders]
     if port.config.order_lifetime is not None:
         orders.append(expired(port.orders))
@@ -59,7 +59,7 @@ def _may_have_paused(port: EwsPort) -> bool:
 class Permission:
     """What a port has been allowed, as far as it is our doing."""
 
-    def __init__(self, port: EwsPort) -> None:
+    def __init__(self, port: EwsReader) -> None:
         """Take the port; what an earlier run of ours has paused nobody knows."""
         self._port = port
         self.paused: bool | None = None if _may_have_paused(port) else False
@@ -137,7 +137,7 @@ class Permission:
         """Stop a charge under way, and keep the cable locked.
 
         ``for_current``: only our limit of 0 A wants so. Raises NotConfirmedError when
-        it goes on, EwsRefusedError when the box says no, and what `EwsPort.look` raises.
+        it goes on, EwsRefusedError when the box says no, and what `EwsReader.look` raises.
         """
         port = self._port
         sends = 0
@@ -217,7 +217,7 @@ class Permission:
 
         Where there is nothing to start, nothing is said. ``still`` is asked right
         before each word. Raises NotAvailableError in a state in which nothing can be
-        started, EwsRefusedError, SupersededError, and what `EwsPort.look` raises.
+        started, EwsRefusedError, SupersededError, and what `EwsReader.look` raises.
         """
         port = self._port
         patience = talk.now + READY_PATIENCE

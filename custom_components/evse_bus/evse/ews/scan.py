@@ -15,8 +15,9 @@ from ..errors import (
     ReplyTimeoutError,
 )
 from ..exchange import Talk
+from ..found import FoundCharger, ScanReport
 from ..jobs import Later
-from ..model import ChargerConfig, FoundCharger, Orders, ScanReport
+from ..model import ChargerConfig, Orders
 from ..turns import in_turns
 from .readings import charger_info, limits_of
 from .session import EwsBox

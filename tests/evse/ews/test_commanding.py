@@ -1,0 +1,190 @@
+"""The clock, and what a person orders once."""
+
+import asyncio
+from datetime import UTC, datetime, timedelta
+import logging
+from zoneinfo import ZoneInfo
+
+import pytest
+
+from custom_components.evse_bus.evse.errors import (
+    NotAvailableError,
+    NotConfirmedError,
+    RefusedOrderError,
+)
+from custom_components.evse_bus.evse.ews import session
+from custom_components.evse_bus.evse.model import (
+    Command,
+    Fault,
+    OrderChange,
+    Status,
+)
+from tests.virtual.ews_rfid import Card
+
+from .ether import EwsScene, now, play, simulate
+
+ON = OrderChange(allowed=True)
+OFF = OrderChange(allowed=False)
+
+
+def amperes(current: float) -> OrderChange:
+    return OrderChange(current=current)
+
+
+def test_the_clock_is_kept_right(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session, "CLOCK_PAUSE", 100.0)
+    zone = ZoneInfo("Europe/Berlin")
+    right = datetime(2026, 7, 1, 10, 0, tzinfo=UTC)
+
+    async def acts(scene: EwsScene) -> None:
+        begin = now()
+        scene.charger().box.clock = lambda: right + timedelta(seconds=now() - begin)
+        assert not scene.line.named("sc")
+        await scene.until(lambda: scene.line.named("sc"))
+        await asyncio.sleep(20)
+        assert f"{scene.box.clock():%Y-%m-%d %H:%M}" == "2026-07-01 12:00"
+        scene.box.set_clock(scene.box.clock() + timedelta(seconds=50))
+        await asyncio.sleep(200)
+        assert len(scene.line.named("sc")) == 1
+        scene.box.set_clock(scene.box.clock() + timedelta(seconds=50))
+        await asyncio.sleep(20)
+        assert len(scene.line.named("sc")) == 2
+
+    async def run() -> None:
+        scene = EwsScene(config={"time_zone": zone})
+        async with scene:
+            scene.charger().box.clock = lambda: datetime(2000, 1, 1, tzinfo=UTC)
+            scene.box.set_clock(datetime.fromisoformat("2000-01-01T01:00"))
+            await scene.settled()
+            await acts(scene)
+
+    simulate(run())
+
+
+def test_without_a_zone_the_clock_is_left_alone() -> None:
+    async def acts(scene: EwsScene) -> None:
+        await asyncio.sleep(60)
+        assert not scene.line.named("sc")
+
+    play(EwsScene(), acts)
+
+
+def test_stop_and_unlock() -> None:
+    async def acts(scene: EwsScene) -> None:
+        await scene.charge()
+        await scene.charger().command(Command.STOP_AND_UNLOCK)
+        assert scene.status() == 0x50
+        assert scene.unlocked() == ["sl 1"]
+        await asyncio.sleep(20)
+        assert scene.connector().status is Status.FINISHING
+
+    play(EwsScene(), acts)
+
+
+def test_stop_and_unlock_after_a_pause() -> None:
+    async def acts(scene: EwsScene) -> None:
+        await scene.charge()
+        await scene.charger().change_orders(OFF)
+        await scene.charger().command(Command.STOP_AND_UNLOCK)
+        assert scene.unlocked() == ["sl 1"]
+
+    play(EwsScene(), acts)
+
+
+@pytest.mark.parametrize("heard", [True, False])
+def test_the_other_commands(*, heard: bool) -> None:
+    """A lost answer decides nothing: the next look does."""
+
+    async def acts(scene: EwsScene) -> None:
+        charger = scene.charger()
+        for command in (Command.LOCK, Command.REQUEST_START):
+            with pytest.raises(NotAvailableError, match="not in state"):
+                await charger.command(command)
+        await charger.command(Command.SET_OPTIMISED, value=True)
+        assert scene.box.ports[0].optimised
+        await charger.command(Command.SET_OPTIMISED, value=False)
+        assert not scene.box.ports[0].optimised
+        with pytest.raises(RefusedOrderError):
+            await charger.command(Command.SET_OPTIMISED, 1)
+        with pytest.raises(NotAvailableError):
+            await charger.command(Command.WAKE)
+        await scene.plug()
+        lost = ["sl"]
+
+        def lose(name: str) -> bool:
+            return bool(lost) and name == "sl" and bool(lost.pop())
+
+        if heard:
+            scene.line.mute = lose
+        else:
+            scene.line.deaf = lose
+        await charger.command(Command.LOCK)
+        assert scene.box.ports[0].locked
+        assert len(scene.line.orders(7)) == (1 if heard else 2)
+        await charger.command(Command.REQUEST_START)
+        assert scene.connector().start_requested
+        assert not scene.unlocked()
+
+    play(EwsScene(), acts)
+
+
+def test_a_request_that_is_lost_is_not_made_again() -> None:
+    async def acts(scene: EwsScene) -> None:
+        await scene.plug()
+        scene.line.deaf = lambda name: name == "sl"
+        with pytest.raises(NotConfirmedError):
+            await scene.charger().command(Command.REQUEST_START)
+        assert len(scene.line.orders(2)) == 1
+
+    play(EwsScene(), acts)
+
+
+def test_a_plug_that_does_not_come_free_is_told() -> None:
+    async def acts(scene: EwsScene) -> None:
+        await scene.charge()
+        scene.box.ports[0].lock.jammed = "unlock"
+        with pytest.raises(NotConfirmedError):
+            await scene.charger().command(Command.STOP_AND_UNLOCK)
+        assert Fault.SOCKET_UNLOCK in scene.charger().faults
+
+    play(EwsScene(), acts)
+
+
+def test_a_reset_that_nobody_answers() -> None:
+    async def acts(scene: EwsScene) -> None:
+        scene.line.mute = lambda name: name == "zz"
+        with pytest.raises(NotConfirmedError):
+            await scene.charger().command(Command.RESET)
+        assert len(scene.line.named("zz")) == 1
+
+    play(EwsScene(), acts)
+
+
+def test_nothing_private_is_kept_of_what_passed(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.DEBUG)
+
+    async def acts(scene: EwsScene) -> None:
+        scene.box.present_card(Card(7, 42, "MAXMUSTR"))
+        await asyncio.sleep(30)
+        passed = b"".join(one.data for one in scene.bus.wire.frames)
+        for secret in (
+            b"geheim",
+            b"4711",
+            b"MAXMUSTR",
+            bytes.fromhex("04112233445566"),
+        ):
+            assert secret not in passed
+            assert secret.decode("latin-1") not in caplog.text
+        assert b"st" in passed
+
+    async def run() -> None:
+        scene = EwsScene(options={"rfid": True})
+        scene.box.system.admin_password = b"geheim".ljust(12, b"\0")
+        scene.box.system.card_pin = b"4711"
+        async with scene:
+            await scene.settled()
+            await acts(scene)
+
+    simulate(run())

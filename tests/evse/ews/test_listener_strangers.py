@@ -1,0 +1,108 @@
+"""Who dials us and is not wanted: little time, few bytes, no trust."""
+
+import asyncio
+from ipaddress import ip_network
+import socket
+
+import pytest
+
+from custom_components.evse_bus.evse.ews import listener as listening
+from tests.virtual.ews_box import EwsBox as VirtualBox
+
+from .dialling import (
+    HOST,
+    SERIAL,
+    dialling,
+    expected,
+    goes,
+    has_reading,
+    run,
+    server,
+    stranger,
+    until,
+)
+
+pytestmark = pytest.mark.usefixtures("socket_enabled")
+
+
+def test_addresses_that_may_not_connect() -> None:
+    async def scene() -> None:
+        async with server(allowed=(ip_network("192.0.2.0/24"),)) as made:
+            with stranger(made) as client:
+                assert await goes(client)
+            assert made.statistics.not_allowed == 1
+        async with (
+            server(allowed=(ip_network("127.0.0.0/8"),)) as made,
+            expected(made) as bus,
+        ):
+            with dialling(made):
+                await until(lambda: has_reading(bus))
+
+    run(scene)
+
+
+def test_silence_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(listening, "IDENTIFY_TIME", 0.5)
+
+    async def scene() -> None:
+        async with server() as made:
+            with stranger(made) as client:
+                assert await goes(client)
+            assert made.statistics.unidentified == 1
+
+    run(scene)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"GET / HTTP/1.1\r\n\r\n" * 100,
+        bytes(2000),
+        b"\x02\x04\x11Cid" + bytes(1200),
+        b"\x02\xff\xffAid" + b"\x02\x00" * 1000,
+        bytes.fromhex("02 000b 49 6966 00 0000000000000000 4d") * 1000,
+    ],
+    ids=["http", "zeros", "over-long", "longest", "records"],
+)
+def test_garbage_ends_a_connection(data: bytes) -> None:
+    async def scene() -> None:
+        async with server() as made:
+            with stranger(made) as client:
+                await asyncio.get_running_loop().sock_sendall(client, data)
+                assert await goes(client, 1.5)
+
+    run(scene)
+
+
+def test_who_sends_slowly_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(listening, "IDENTIFY_TIME", 0.5)
+
+    async def scene() -> None:
+        box = VirtualBox(serial=SERIAL)
+        async with server() as made, expected(made) as bus:
+            with dialling(made, box) as dialler:
+                dialler.pace = (1, 0.05)
+                await until(lambda: made.statistics.unidentified >= 2)
+                assert not bus.connected
+
+    run(scene)
+
+
+def test_who_says_nothing_does_not_keep_boxes_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(listening, "GRACE", 0.1)
+
+    async def scene() -> None:
+        async with server() as made, expected(made) as bus:
+            silent = [socket.create_connection((HOST, made.port)) for _ in range(40)]
+            await until(lambda: made.statistics.accepted + made.statistics.crowded_out)
+            await asyncio.sleep(0.2)
+            with dialling(made):
+                await until(lambda: has_reading(bus))
+            assert made.statistics.crowded_out > 0
+            assert len(made._unidentified) <= listening.MOST_UNIDENTIFIED
+            for one in silent:
+                one.close()
+
+    run(scene)

@@ -1,0 +1,109 @@
+"""Info records at any moment, and the events that come of them."""
+
+import asyncio
+
+import pytest
+
+from custom_components.evse_bus.evse.ews.events import CardPresented
+from custom_components.evse_bus.evse.ews.info import KeyEvent
+from custom_components.evse_bus.evse.ews.status import StartRelease
+from custom_components.evse_bus.evse.model import (
+    OrderChange,
+)
+from tests.virtual.ews_records import InfoMix
+from tests.virtual.ews_rfid import Card
+
+from .ether import EwsScene, now, play
+
+ON = OrderChange(allowed=True)
+OFF = OrderChange(allowed=False)
+
+
+def amperes(current: float) -> OrderChange:
+    return OrderChange(current=current)
+
+
+@pytest.mark.parametrize("name", ["rc", "rd"])
+def test_a_record_at_every_position_of_an_answer(name: str) -> None:
+    """Also at the very edges; no command is lost, and none is answered by it."""
+    length = {"rc": 115, "rd": 63}[name]
+
+    async def acts(scene: EwsScene) -> None:
+        for at in range(length + 1):
+            infos = scene.charger().box.changes
+            if name == "rd":
+                scene.box.mix_info(InfoMix("none"), InfoMix("inside", at=at))
+            else:
+                scene.box.mix_info(InfoMix("inside", at=at))
+            scene.charger().ask_now()
+            await asyncio.sleep(0.6)
+            assert scene.charger().box.changes > infos, at
+        assert scene.charger().statistics.timeouts == 0
+        assert scene.charger().available
+        assert scene.bus.wire.statistics.bad_frames == 0
+
+    play(EwsScene(ports=(1,)), acts)
+
+
+@pytest.mark.parametrize("where", ["before", "after"])
+@pytest.mark.parametrize("cut", [1, 3, 8, 15, 16, 17, 20])
+def test_a_record_beside_the_answer_to_an_order(where: str, cut: int) -> None:
+    async def acts(scene: EwsScene) -> None:
+        await scene.charge()
+        mix = InfoMix(where, cut=cut)  # type: ignore[arg-type]
+        scene.box.mix_info(InfoMix("none"), mix, mix, mix)
+        await scene.charger().change_orders(OFF)
+        await asyncio.sleep(5)
+        assert len(scene.line.orders(6)) == 1
+        assert scene.status() == 0x50
+        assert not scene.unlocked()
+
+    play(EwsScene(ports=(1,)), acts)
+
+
+def test_a_record_is_followed_by_a_poll_at_once() -> None:
+    async def acts(scene: EwsScene) -> None:
+        await scene.plug()
+        await asyncio.sleep(3)
+        await scene.until(lambda: scene.line.sent[-1].when < now() - 0.5)
+        begin = now()
+        scene.box.press_key(1, 1)
+        await scene.until(lambda: scene.connector().start_requested)
+        assert now() - begin < 0.1
+        assert scene.charger().seen.start is StartRelease.REQUESTED  # type: ignore[union-attr]
+
+    play(EwsScene(), acts)
+
+
+def test_keys_and_cards_are_events() -> None:
+    async def acts(scene: EwsScene) -> None:
+        mine: list[object] = []
+        scene.charger(2).subscribe_events(mine.append)
+        scene.box.press_key(2, 3, 0.7)
+        await asyncio.sleep(2)
+        scene.box.present_card(Card(7, 42, "MAX"))
+        await asyncio.sleep(1)
+        assert mine[:2] == [KeyEvent(2, 3, None), KeyEvent(2, 3, 0.7)]
+        (card,) = (one for one in mine if isinstance(one, CardPresented))
+        assert (card.group, card.number, card.user) == (7, 42, "MAX")
+        assert card.readable
+        assert "MAX" not in repr(card)
+        assert "42" not in repr(card)
+        scene.box.press_key(1, 1, 0.2)
+        await asyncio.sleep(2)
+        assert KeyEvent(1, 1, None) in scene.events
+        assert KeyEvent(1, 1, None) not in mine
+        assert len([one for one in mine if isinstance(one, CardPresented)]) == 1
+
+    play(EwsScene(options={"manual_io": True, "rfid": True}), acts)
+
+
+def test_a_flood_of_records_starves_nobody() -> None:
+    async def acts(scene: EwsScene) -> None:
+        for _ in range(500):
+            scene.box.send_raw(scene.box._record(4, {}))
+            await asyncio.sleep(0.01)
+        await scene.charger().change_orders(amperes(10.0))
+        assert scene.bus.wire.statistics.utilisation(now()) < 0.5  # type: ignore[operator]
+
+    play(EwsScene(), acts)
