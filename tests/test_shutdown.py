@@ -164,12 +164,12 @@ async def test_an_unplugged_adapter_holds_nothing_up(
     assert "Charger 0 was not told that Home Assistant stops" in caplog.text
 
 
-async def fail(_charger: object) -> None:
+async def fail(_charger: object, **_how: bool) -> None:
     message = "unforeseen"
     raise RuntimeError(message)
 
 
-async def hang(_charger: object) -> None:
+async def hang(_charger: object, **_how: bool) -> None:
     await asyncio.Event().wait()
 
 
@@ -182,7 +182,7 @@ async def test_a_mistake_of_ours_holds_nothing_up(
     hass: HomeAssistant,
     caplog: pytest.LogCaptureFixture,
     monkeypatch: pytest.MonkeyPatch,
-    farewell: Callable[[object], Awaitable[None]],
+    farewell: Callable[..., Awaitable[None]],
     said: str,
 ) -> None:
     monkeypatch.setattr(PolledSmartEvse, "farewell", farewell)

@@ -255,6 +255,22 @@ async def test_without_supply_they_wait_and_are_still_allowed(
         assert state_of(hass, two) == "off"
 
 
+async def test_a_slave_that_is_removed_while_it_charges_is_stopped(
+    hass: HomeAssistant,
+) -> None:
+    """It would follow what the others are told, and nobody would count it."""
+    boxes = slaves()
+    async with running(hass, *boxes, supply=SUPPLY) as (entry, bus):
+        await both_charge(hass, entry, boxes)
+        gone = next(iter(entry.subentries.values()))
+        hass.config_entries.async_remove_subentry(entry, gone.subentry_id)
+        await bus.wait_for_async(lambda: not boxes[0].contactor, timeout=10)
+        await hass.async_block_till_done()
+        assert not boxes[0].access
+        assert boxes[1].contactor
+        await bus.wait_for_async(lambda: boxes[1].pilot_current == 16, timeout=10)
+
+
 async def test_the_slaves_stop_without_home_assistant(hass: HomeAssistant) -> None:
     boxes = slaves()
     async with running(hass, *boxes, supply=SUPPLY, time_scale=2) as (entry, bus):

@@ -27,7 +27,7 @@ from .const import (
     SUBENTRY_CHARGER,
 )
 from .evse.errors import RefusedOrderError
-from .evse.model import ScanReport
+from .evse.found import ScanReport
 from .evse.protocol import Progress, Protocol
 from .evse.protocols import PROTOCOLS
 from .flow_address import ADDRESSES, Errors, typed_addresses

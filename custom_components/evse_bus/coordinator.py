@@ -223,6 +223,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
 
     async def _remove(self, unit: ChargerUnit) -> None:
         unit.unsubscribe()
+        await async_say_farewell([unit.charger], for_good=True)
         await self.bus.remove(unit.charger)
         del self.units[unit.subentry_id]
         self.issues.forget(unit)

@@ -43,7 +43,7 @@ from .flow_schema import (
 if TYPE_CHECKING:
     from homeassistant.config_entries import ConfigSubentry, ConfigSubentryData
 
-    from .evse.model import FoundCharger
+    from .evse.found import FoundCharger
     from .evse.protocol import Protocol
 
 CONF_EXPERT: Final = "expert"

@@ -23,8 +23,9 @@ from .evse.errors import (
     PortPermissionError,
     PortSettingsError,
 )
+from .evse.found import ScanReport
 from .evse.line import Line
-from .evse.model import ChargerConfig, CurrentLimit, Orders, ScanReport
+from .evse.model import ChargerConfig, CurrentLimit, Orders
 from .flow_address import ADDRESSES
 from .flow_schema import CONF_SEARCH_CURRENT
 

@@ -39,8 +39,8 @@ from .evse.safety import INTERVALS_PER_TIMEOUT, MAXIMUM_TIMEOUT, number
 from .flow_address import ADDRESSES, Errors
 
 if TYPE_CHECKING:
+    from .evse.found import FoundCharger
     from .evse.framing import LineSettings
-    from .evse.model import FoundCharger
     from .evse.protocol import Protocol
 
 # Keys of the forms that are stored under another name, or not at all.

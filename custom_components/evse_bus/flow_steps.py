@@ -13,7 +13,7 @@ from .const import (
     CONF_INSTALLATION_LIMIT,
     SUBENTRY_CHARGER,
 )
-from .evse.model import ScanReport
+from .evse.found import ScanReport
 from .flow_address import ADDRESSES, Errors, manual_form, typed_addresses
 from .flow_charger import (
     Candidate,
@@ -35,7 +35,7 @@ from .flow_supply import supply_texts
 from .setup import charger_unique_id, line_settings
 
 if TYPE_CHECKING:
-    from .evse.model import FoundCharger
+    from .evse.found import FoundCharger
     from .evse.protocol import Progress, Protocol
 
 

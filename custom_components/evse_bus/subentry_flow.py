@@ -21,7 +21,7 @@ from .const import (
     SUBENTRY_CHARGER,
 )
 from .evse.errors import NotAvailableError
-from .evse.model import ScanReport
+from .evse.found import ScanReport
 from .flow_address import ADDRESSES, Errors, typed_addresses
 from .flow_charger import (
     charger_data,

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, ClassVar
 from .errors import NotAvailableError
 from .exchange import Talk
 from .framing import Frame, Timing
-from .jobs import Job, Later, Step
+from .jobs import Job, Later, Step, merge_key
 from .listeners import tell
 from .model import (
     Capability,
@@ -174,8 +174,12 @@ class Charger(ABC):
         """Return an urgent turn for a frame nobody asked for; ``None``: not mine."""
         return None
 
-    async def farewell(self) -> None:  # noqa: B027 - most have nothing to say
+    async def farewell(  # noqa: B027 - most have nothing to say
+        self, *, for_good: bool = False
+    ) -> None:
         """Say what is to be said when everything stops; orders stay as they are.
+
+        ``for_good``: only this charger is taken off, for ever; the bus goes on.
 
         Raises what `run` raises.
         """
@@ -250,7 +254,7 @@ class Charger(ABC):
         """
         checked = check_change(change, self.limits)
         loop = asyncio.get_running_loop()
-        if _is_about_now(checked):
+        if checked.is_about_now:
             self._renewed = loop.time()
             self.orders_expired = False
         self._wish = checked.apply(self._wish)
@@ -271,7 +275,7 @@ class Charger(ABC):
             meets=self.slot if self.orders_keep_alive else None,
             step=_nothing,
             persistence=Persistence.STANDING,
-            merge_key=_merge_key(checked),
+            merge_key=merge_key(checked),
             change=checked,
         )
         job.step = partial(self._impose_job, job)
@@ -435,17 +439,6 @@ class Charger(ABC):
     def notice(self, fault: Fault, *, present: bool) -> None:
         """Set or clear a fault that we noticed ourselves."""
         self.noticed = self.noticed | {fault} if present else self.noticed - {fault}
-
-
-def _is_about_now(change: OrderChange) -> bool:
-    """Return whether a change says how to charge now, not just the fail-safe."""
-    said = (change.allowed, change.current, *change.phases)
-    return any(value is not None for value in said)
-
-
-def _merge_key(change: OrderChange) -> str | None:
-    """Merge limits with limits and pauses with pauses, and nothing with a start."""
-    return {None: "limits", False: "pause", True: None}[change.allowed]
 
 
 async def _no_commit(_orders: Orders) -> None:

@@ -144,6 +144,11 @@ class JobQueue:
             self._jobs.remove(job)
 
 
+def merge_key(change: OrderChange) -> str | None:
+    """Merge limits with limits and pauses with pauses, and nothing with a start."""
+    return {None: "limits", False: "pause", True: None}[change.allowed]
+
+
 def _raises(job: Job) -> bool:
     """Return whether a change asks for more than stands; a pause never does."""
     if job.charger is None or job.change is None or job.change.allowed is False:

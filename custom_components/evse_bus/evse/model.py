@@ -262,6 +262,12 @@ class OrderChange:
             ),
         )
 
+    @property
+    def is_about_now(self) -> bool:
+        """Return whether it says how to charge now, not just the fail-safe."""
+        said = (self.allowed, self.current, *self.phases)
+        return any(value is not None for value in said)
+
     def merged_with(self, newer: OrderChange) -> OrderChange:
         """Return both changes as one; the newer wins where both speak."""
         merged = {
@@ -441,30 +447,3 @@ class Supply:
     """A for each phase, all chargers together."""
     minimum: float = MINIMUM_CURRENT
     """Each charger that charges gets at least this, A; else nothing."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FoundCharger:
-    """A charger that answered a scan."""
-
-    address: int
-    info: ChargerInfo
-    serial: str | None = None
-    maximum_current: float | None = None
-    """Maximum that it told, A."""
-    connectors: int = 1
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ScanReport:
-    """What a scan of a bus found."""
-
-    found: tuple[FoundCharger, ...] = ()
-    duplicates: tuple[int, ...] = ()
-    """Addresses at which more than one charger answers."""
-    unreadable: bool = False
-    """Bytes came that no frame could be made of: wrong protocol or parity."""
-    unsupported: tuple[FoundCharger, ...] = ()
-    """Those that answered with a firmware that cannot be used this way."""
-    other_master: bool = False
-    """Another master speaks on this line; so we said nothing."""

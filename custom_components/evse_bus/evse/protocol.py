@@ -12,8 +12,9 @@ if TYPE_CHECKING:
 
     from .charger import Charger
     from .duty import Duty
+    from .found import ScanReport
     from .framing import Frame, Framer, LineSettings, Timing
-    from .model import ChargerConfig, Orders, ScanReport
+    from .model import ChargerConfig, Orders
 
 type Progress = Callable[[float], None]
 """Called with the share of a scan that is done, 0..1."""

@@ -7,7 +7,7 @@ from time import monotonic
 import pytest
 
 from custom_components.evse_bus.evse.errors import LineLostError
-from custom_components.evse_bus.evse.model import ScanReport
+from custom_components.evse_bus.evse.found import ScanReport
 from tests.virtual import AblBox
 
 from .scene import READING, Scene, config, orders, until

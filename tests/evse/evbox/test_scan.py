@@ -8,7 +8,8 @@ import pytest
 
 from custom_components.evse_bus.evse.errors import LineBusyError, RefusedOrderError
 from custom_components.evse_bus.evse.evbox import PROTOCOL, EvboxConfig
-from custom_components.evse_bus.evse.model import CurrentLimit, Orders, ScanReport
+from custom_components.evse_bus.evse.found import ScanReport
+from custom_components.evse_bus.evse.model import CurrentLimit, Orders
 from tests.evse.simulated import now, simulate
 from tests.virtual import EvboxChargePoint, Module
 from tests.virtual.evbox_frames import frame

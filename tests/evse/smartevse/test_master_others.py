@@ -6,12 +6,8 @@ import pytest
 
 from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.errors import NotAvailableError, RefusedOrderError
-from custom_components.evse_bus.evse.model import (
-    Fault,
-    OrderChange,
-    ScanReport,
-    Supply,
-)
+from custom_components.evse_bus.evse.found import ScanReport
+from custom_components.evse_bus.evse.model import Fault, OrderChange, Supply
 from custom_components.evse_bus.evse.smartevse import MASTER
 from custom_components.evse_bus.evse.smartevse.master import OTHERS, Master
 from tests.evse.simulated import now, simulate

@@ -7,11 +7,11 @@ from typing import ClassVar, Literal, override
 import pytest
 
 from custom_components.evse_bus.evse.bus import Bus
+from custom_components.evse_bus.evse.found import ScanReport
 from custom_components.evse_bus.evse.model import (
     CurrentLimit,
     OrderChange,
     Orders,
-    ScanReport,
     Supply,
 )
 from custom_components.evse_bus.evse.smartevse import MASTER, SlaveConfig, master

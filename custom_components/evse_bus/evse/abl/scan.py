@@ -9,8 +9,9 @@ from typing import Final
 from ..bus import Bus
 from ..errors import GarbledReplyError, LineBusyError, ReplyTimeoutError
 from ..exchange import Talk
+from ..found import FoundCharger, ScanReport
 from ..modbus import ModbusFrame
-from ..model import ChargerConfig, ChargerInfo, FoundCharger, Orders, ScanReport
+from ..model import ChargerConfig, ChargerInfo, Orders
 from ..protocol import Progress
 from .exchanges import read
 from .readings import charger_info

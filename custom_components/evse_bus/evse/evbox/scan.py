@@ -15,7 +15,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from ..errors import GarbledReplyError, RefusedOrderError, ReplyTimeoutError
-from ..model import ChargerConfig, FoundCharger, Limits, Orders, ScanReport
+from ..found import FoundCharger, ScanReport
+from ..model import ChargerConfig, Limits, Orders
 from .config import EvboxConfig, evbox_config
 from .frames import ANY_SERIAL, EvboxFrame, Reply, decode_reply
 from .plausibility import range_oddities

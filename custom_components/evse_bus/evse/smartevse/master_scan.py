@@ -16,14 +16,8 @@ from ..errors import (
     ReplyTimeoutError,
 )
 from ..exchange import Talk
-from ..model import (
-    ChargerConfig,
-    Fault,
-    FoundCharger,
-    Orders,
-    ScanReport,
-    Setting,
-)
+from ..found import FoundCharger, ScanReport
+from ..model import ChargerConfig, Fault, Orders, Setting
 from .balancing import SLAVES
 from .dialects import MAPS, Block, Dialect
 from .exchanges import read

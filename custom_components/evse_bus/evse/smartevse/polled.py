@@ -128,8 +128,8 @@ class PolledBox(SmartEvseBox):
     # -- The end ---------------------------------------------------------------------
 
     @override
-    async def farewell(self) -> None:
-        if not polled_config(self.config).stop_on_shutdown:
+    async def farewell(self, *, for_good: bool = False) -> None:
+        if for_good or not polled_config(self.config).stop_on_shutdown:
             return
         # A start half done would come to its end after this.
         self.leaves = True

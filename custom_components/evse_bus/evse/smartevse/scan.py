@@ -18,7 +18,8 @@ from ..errors import (
     ReplyTimeoutError,
 )
 from ..exchange import Talk
-from ..model import ChargerConfig, FoundCharger, Orders, ScanReport, Setting
+from ..found import FoundCharger, ScanReport
+from ..model import ChargerConfig, Orders, Setting
 from .dialects import MAPS, Dialect
 from .exchanges import read
 from .probing import Probe

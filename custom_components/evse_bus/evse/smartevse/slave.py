@@ -16,7 +16,8 @@ from ..exchange import Talk
 from ..framing import Frame
 from ..jobs import Later
 from ..modbus import ModbusFrame
-from ..model import Fault, OrderChange, Orders
+from ..model import Fault, OrderChange, Orders, Persistence
+from ..schedule import Kind
 from ..turns import Turns, in_turns
 from .answers import ANSWER_BYTES, ANSWER_WITHIN, Answer
 from .balancing import RequestKind, SlaveRequest, acknowledge, decode_request
@@ -148,6 +149,18 @@ class SlaveSmartEvse(Member):
     def _changed(self) -> None:
         with suppress(NotAvailableError):
             self.master.changed()
+
+    # -- The end -------------------------------------------------------------------
+
+    @override
+    async def farewell(self, *, for_good: bool = False) -> None:
+        if for_good:
+            # It would follow the broadcasts to the others, and nobody would count it.
+            await self.run(
+                in_turns(partial(self.set_access, allowed=False)),
+                persistence=Persistence.STANDING,
+                kind=Kind.PAUSE,
+            )
 
     # -- Its requests --------------------------------------------------------------
 

@@ -1,0 +1,32 @@
+"""What a scan of a bus found."""
+
+from dataclasses import dataclass
+
+from .model import ChargerInfo
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FoundCharger:
+    """A charger that answered a scan."""
+
+    address: int
+    info: ChargerInfo
+    serial: str | None = None
+    maximum_current: float | None = None
+    """Maximum that it told, A."""
+    connectors: int = 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScanReport:
+    """What a scan of a bus found."""
+
+    found: tuple[FoundCharger, ...] = ()
+    duplicates: tuple[int, ...] = ()
+    """Addresses at which more than one charger answers."""
+    unreadable: bool = False
+    """Bytes came that no frame could be made of: wrong protocol or parity."""
+    unsupported: tuple[FoundCharger, ...] = ()
+    """Those that answered with a firmware that cannot be used this way."""
+    other_master: bool = False
+    """Another master speaks on this line; so we said nothing."""
