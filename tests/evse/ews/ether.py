@@ -87,6 +87,8 @@ class Ether(Line):
         """Its answer is not heard."""
         self.cut = False
         """Nothing passes."""
+        self.held_until = 0.0
+        """What the box says before this time arrives then, in its order."""
         self.lumps = 1
         """Bytes that arrive at once."""
         self._open = False
@@ -134,7 +136,7 @@ class Ether(Line):
         if self.cut or (is_answer and self.mute(data[4:6].decode("latin-1"))):
             return
         loop = asyncio.get_running_loop()
-        begin = max(now(), self._free_at)
+        begin = max(now(), self._free_at, self.held_until)
         self._free_at = begin + len(data) * BYTE
         size = self.lumps if self.lumps > 0 else len(data)
         for at in range(0, len(data), size):
