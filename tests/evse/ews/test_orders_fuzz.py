@@ -13,7 +13,7 @@ from hypothesis import given, settings, strategies as st
 from custom_components.evse_bus.evse.errors import EvseError
 from custom_components.evse_bus.evse.model import Command, OrderChange
 
-from .ether import EwsScene, play
+from .ether import EwsScene, now, play
 
 WAITS = st.sampled_from((0.0, 0.05, 0.3, 1.0, 3.0, 8.0))
 ACTS = st.one_of(
@@ -22,6 +22,7 @@ ACTS = st.one_of(
     st.tuples(st.just("car"), st.sampled_from(("ask", "finish")), WAITS),
     st.tuples(st.just("lose"), st.sampled_from(("rc", "rd", "sl", "st")), WAITS),
     st.tuples(st.just("deaf"), st.sampled_from(("rc", "rd", "sl", "st")), WAITS),
+    st.tuples(st.just("late"), st.sampled_from((0.3, 0.503, 0.52, 1.2)), WAITS),
     st.tuples(st.just("line"), st.just(None), WAITS),
     st.tuples(st.just("optimise"), st.booleans(), WAITS),
 )
@@ -71,6 +72,9 @@ class Run:
             self.lost.append(str(value))
         elif what == "deaf":
             self.deaf.append(str(value))
+        elif what == "late":
+            assert isinstance(value, float)
+            self.scene.line.held_until = now() + value
         elif what == "optimise":
             self.tasks.append(asyncio.ensure_future(self.optimise(value)))
         else:
