@@ -112,7 +112,8 @@ def test_a_box_that_stays_above_its_share_is_told_of() -> None:
             # Said again with each reading that shows it, beside the regular ones.
             assert len(scene.broadcasts(begin)) >= 5
             scene.box(2).misses = lambda _data: False
-            await asyncio.sleep(3)
+            # The next broadcast, and the reading after it.
+            await asyncio.sleep(5)
             assert scene.offers == 10
             assert Fault.LIMIT_NOT_TAKEN not in scene.slave(2).faults
 
@@ -312,5 +313,25 @@ def test_only_what_a_slave_follows_can_be_set_in_it() -> None:
             await scene.slave(2).configure(Setting.MAXIMUM_CURRENT, 10)
             await asyncio.sleep(3)
             assert scene.offers == 10
+
+    simulate(scene())
+
+
+def test_one_goes_up_as_soon_as_the_other_has_confirmed_that_it_went_down() -> None:
+    async def scene() -> None:
+        async with MasterScene(units=(2, 3), limit=20.0) as scene:
+            await asyncio.sleep(5)
+            await scene.slave(2).change_orders(OrderChange(current=16.0))
+            await scene.slave(3).change_orders(OrderChange(current=6.0))
+            await scene.charge(2, 3)
+            await scene.until(lambda: scene.box(2).offers == 14)
+            for wait in (0.3, 0.9, 1.5):
+                await asyncio.sleep(wait)
+                await scene.slave(3).change_orders(OrderChange(current=10.0))
+                took = await scene.until(lambda: scene.box(3).offers == 10)
+                # No poll is waited for, at most the broadcast that is due.
+                assert took < 0.8
+                await scene.slave(3).change_orders(OrderChange(current=6.0))
+                await scene.until(lambda: scene.box(2).offers == 14)
 
     simulate(scene())

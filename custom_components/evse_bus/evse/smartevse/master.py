@@ -273,9 +273,15 @@ class Master(Duty):
                 slave.share = values[slave.unit] / 10
                 setpoints[slave.unit] = slave.setpoint
         words = [setpoints.get(unit) for unit in range(1, CURRENTS + 1)]
+        before = self._sent
         self._sent = tuple(0 if one is None else tenths(one) for one in words)
         for unit, draw in self._draws.items():
             draw.said(self._sent[unit - 1], now)
+        for slave in self.slaves:
+            lower = before and self._sent[slave.unit - 1] < before[slave.unit - 1]
+            if lower and self.draw(slave.unit).may_draw:
+                # Until it has confirmed that, nobody else can go up.
+                slave.look_soon(now)
         raw = broadcast(words)
         self._spoke_at = now
         self._spoken = [one for one in self._spoken if now - one[0] <= ECHO]

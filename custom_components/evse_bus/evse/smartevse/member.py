@@ -172,16 +172,17 @@ class Member(SmartEvseBox):
             charges = self.status is not None and self.status.raw_state in CHARGING
             if share < LOWEST <= tenths(self.wanted) and charges:
                 self._withheld_at = now
-                self._tend_soon(now)
+                self.look_soon(now)
         elif (
             share >= LOWEST
             and now >= self._withheld_at + GIVE_BACK
             and not self.master.draw(self.unit).may_draw
         ):
             self._withheld_at = None
-            self._tend_soon(now)
+            self.look_soon(now)
 
-    def _tend_soon(self, now: float) -> None:
+    def look_soon(self, now: float) -> None:
+        """Let it be read as soon as the bus is free."""
         self.slot.ready = self.slot.due = min(self.slot.ready, now)
         if self.bus is not None:
             self.bus.look_again()
@@ -231,7 +232,7 @@ class Member(SmartEvseBox):
         super().take(status, now)
         if self.configuration is None:
             # Without it the limit is 6 A: a box that charges must not wait for it.
-            self._tend_soon(now)
+            self.look_soon(now)
         closed = status.raw_state in CHARGING
         if status.raw_state == UNPLUGGED:
             # The next car may come with another cable.

@@ -174,19 +174,19 @@ class SlaveSmartEvse(Member):
         now = self.master.now
         if self.dialect is not Dialect.V2_17:
             # Nothing is said to a box that we have not read.
-            self._tend_soon(now)
+            self.look_soon(now)
             return Later(0.0, _nothing, 0.0)
         if request.kind in (RequestKind.B, RequestKind.C):
             self._own_maximum = request.wanted
             if self.may_begin() and self._is_refused:
                 # Opened at the box since, or closed since it asked: to be read first.
                 # It asks again in a second.
-                self._tend_soon(now)
+                self.look_soon(now)
                 return Later(0.0, _nothing, 0.0)
         else:
             # What it leaves the others need not wait for.
             self._promised_until = -inf
-            self._tend_soon(now)
+            self.look_soon(now)
         if now < self._answering.get(request.kind, -inf):
             return Later(0.0, _nothing, 0.0)
         self._answering[request.kind] = now + ANSWER_WITHIN
