@@ -399,7 +399,7 @@ class Bus:
             charger.slot.ready = now + charger.minimum_pause(now)
         if self.duty is not None:
             self.duty.on_line_open(now)
-        self._tell()
+        tell(self._listeners)
 
     def _on_lost(self, error: LineLostError) -> None:
         _LOGGER.warning("%s: the port was lost (%s), trying again", self.name, error)
@@ -409,7 +409,7 @@ class Bus:
         if self.duty is not None:
             self.duty.slot.start_by = inf
         self._abandon_chargers()
-        self._tell()
+        tell(self._listeners)
         self.look_again()
 
     def hush(self, why: str) -> None:
@@ -442,9 +442,6 @@ class Bus:
                 self.wire.statistics.reopened += 1
             self._on_open()
             return True
-
-    def _tell(self) -> None:
-        tell(self._listeners)
 
 
 def _belongs(slot: Slot, charger: Charger) -> bool:
