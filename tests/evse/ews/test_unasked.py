@@ -61,6 +61,25 @@ def test_a_record_beside_the_answer_to_an_order(where: str, cut: int) -> None:
     play(EwsScene(ports=(1,)), acts)
 
 
+@pytest.mark.parametrize("at", range(9))
+@pytest.mark.parametrize("name", ["sl", "rc"])
+def test_a_record_inside_the_conversation_of_a_pause(name: str, at: int) -> None:
+    """Inside the answer to order 6, and inside the look right before it."""
+
+    async def acts(scene: EwsScene) -> None:
+        await scene.charge()
+        inside = InfoMix("inside", at=at, bits=0b100)
+        scene.box.mix_info(*([InfoMix("none")] if name == "sl" else []), inside)
+        await scene.charger().change_orders(OFF)
+        await asyncio.sleep(5)
+        assert len(scene.line.orders(6)) == 1
+        assert scene.status() == 0x50
+        assert not scene.unlocked()
+        assert scene.charger().statistics.timeouts == 0
+
+    play(EwsScene(ports=(1,)), acts)
+
+
 def test_a_record_is_followed_by_a_poll_at_once() -> None:
     async def acts(scene: EwsScene) -> None:
         await scene.plug()
