@@ -221,9 +221,12 @@ async def test_echo_noise_and_errors_are_never_misread() -> None:
 
         charger.subscribe(note)
         await scene.polled(charger, 25)
+        async with asyncio.timeout(30):
+            # Until the dice have damaged an answer.
+            while not scene.bus.wire.statistics.bad_frames:
+                await scene.polled(charger, 5)
         assert seen <= {9.96}
         assert set(scene.writes(LIMIT)) == {166}
-        assert scene.bus.wire.statistics.bad_frames
 
 
 async def test_two_boxes_do_not_mix() -> None:
