@@ -22,7 +22,8 @@ from .entity import (
     supported,
 )
 from .evse.duty import Duty
-from .evse.model import Capability, ConnectorReading, Fault
+from .evse.model import Capability, Fault
+from .evse.readings import ConnectorReading
 from .sensor_tables import WAITING
 from .unit import ChargerUnit
 

@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
 
     from .evse.charger import Charger
-    from .evse.model import Capability, ConnectorReading, Range, Setting
+    from .evse.model import Capability, Range, Setting
+    from .evse.readings import ConnectorReading
 
 
 _GROWING: Final = (ConfigEntryState.SETUP_IN_PROGRESS, ConfigEntryState.LOADED)

@@ -23,14 +23,8 @@ from homeassistant.const import (
 
 from .coordinator import BusCoordinator
 from .evse.charger import Charger
-from .evse.model import (
-    Capability,
-    ChargerReading,
-    ConnectorReading,
-    Fault,
-    Phases,
-    Status,
-)
+from .evse.model import Capability, Fault, Phases, Status
+from .evse.readings import ChargerReading, ConnectorReading
 
 NO_FAULT: Final = "none"
 

@@ -4,7 +4,7 @@ from homeassistant.config_entries import ConfigSubentry
 from homeassistant.core import CALLBACK_TYPE
 
 from .evse.charger import Charger
-from .evse.model import ConnectorReading
+from .evse.readings import ConnectorReading
 
 
 class ChargerUnit:

@@ -25,12 +25,12 @@ from custom_components.evse_bus.evse.line import Line
 from custom_components.evse_bus.evse.model import (
     Capability,
     ChargerConfig,
-    ChargerReading,
     CurrentLimit,
     Limits,
     OrderChange,
     Orders,
 )
+from custom_components.evse_bus.evse.readings import ChargerReading
 from custom_components.evse_bus.evse.safety import clamp
 
 SETTINGS = LineSettings(baudrate=38400)

@@ -26,8 +26,6 @@ from .listeners import tell
 from .model import (
     Capability,
     ChargerConfig,
-    ChargerInfo,
-    ChargerReading,
     Command,
     Fault,
     Limits,
@@ -37,6 +35,7 @@ from .model import (
     Range,
     Setting,
 )
+from .readings import ChargerInfo, ChargerReading
 from .safety import Setpoint, cautious, check_change, clamp, expired
 from .schedule import Kind, Slot
 from .statistics import ChargerStatistics

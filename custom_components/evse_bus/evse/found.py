@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from .model import ChargerInfo
+from .readings import ChargerInfo
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -22,13 +22,8 @@ from custom_components.evse_bus.evse.abl.registers import (
     decode_info,
     decode_reading,
 )
-from custom_components.evse_bus.evse.model import (
-    UNKNOWN_PHASES,
-    ChargerReading,
-    ConnectorReading,
-    Fault,
-    Status,
-)
+from custom_components.evse_bus.evse.model import UNKNOWN_PHASES, Fault, Status
+from custom_components.evse_bus.evse.readings import ChargerReading, ConnectorReading
 
 if TYPE_CHECKING:
     from custom_components.evse_bus.evse.model import Phases

@@ -9,7 +9,7 @@ from custom_components.evse_bus.evse.evbox.reading import (
     same_serial,
     serial_number,
 )
-from custom_components.evse_bus.evse.model import ConnectorReading
+from custom_components.evse_bus.evse.readings import ConnectorReading
 
 from .replies import module, reply
 

@@ -16,13 +16,8 @@ from custom_components.evse_bus.evse.ews.events import Event
 from custom_components.evse_bus.evse.ews.timing import SETTINGS
 from custom_components.evse_bus.evse.framing import Timing
 from custom_components.evse_bus.evse.line import Line
-from custom_components.evse_bus.evse.model import (
-    ChargerReading,
-    ConnectorReading,
-    CurrentLimit,
-    OrderChange,
-    Orders,
-)
+from custom_components.evse_bus.evse.model import CurrentLimit, OrderChange, Orders
+from custom_components.evse_bus.evse.readings import ChargerReading, ConnectorReading
 from tests.evse.simulated import now, simulate
 from tests.virtual import Car
 from tests.virtual.ews_box import EwsBox as VirtualBox

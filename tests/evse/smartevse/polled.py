@@ -7,12 +7,8 @@ from dataclasses import dataclass, field
 from typing import Self
 
 from custom_components.evse_bus.evse.bus import Bus
-from custom_components.evse_bus.evse.model import (
-    ChargerReading,
-    ConnectorReading,
-    CurrentLimit,
-    Orders,
-)
+from custom_components.evse_bus.evse.model import CurrentLimit, Orders
+from custom_components.evse_bus.evse.readings import ChargerReading, ConnectorReading
 from custom_components.evse_bus.evse.smartevse import POLLED
 from custom_components.evse_bus.evse.smartevse.charger import (
     PolledConfig,

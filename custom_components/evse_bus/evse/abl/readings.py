@@ -2,15 +2,8 @@
 
 from dataclasses import dataclass
 
-from ..model import (
-    UNKNOWN_PHASES,
-    ChargerInfo,
-    ChargerReading,
-    ConnectorReading,
-    Fault,
-    Phases,
-    Status,
-)
+from ..model import UNKNOWN_PHASES, Fault, Phases, Status
+from ..readings import ChargerInfo, ChargerReading, ConnectorReading
 from .duty import PAUSE, current_for
 from .registers import Flags, Info, Reading
 from .states import B1, B2, C3, C4, state_of

@@ -11,8 +11,9 @@ from ..errors import GarbledReplyError, LineBusyError, ReplyTimeoutError
 from ..exchange import Talk
 from ..found import FoundCharger, ScanReport
 from ..modbus import ModbusFrame
-from ..model import ChargerConfig, ChargerInfo, Orders
+from ..model import ChargerConfig, Orders
 from ..protocol import Progress
+from ..readings import ChargerInfo
 from .exchanges import read
 from .readings import charger_info
 from .registers import (

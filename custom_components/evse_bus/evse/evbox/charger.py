@@ -26,7 +26,8 @@ from typing import TYPE_CHECKING, Final, override
 
 from ..charger import Charger
 from ..errors import GarbledReplyError, ImplausibleReplyError, WrongChargerError
-from ..model import Capability, ChargerReading, Fault, Limits, OrderChange, Orders
+from ..model import Capability, Fault, Limits, OrderChange, Orders
+from ..readings import ChargerReading
 from ..safety import INTERVALS_PER_TIMEOUT, Setpoint
 from ..schedule import Kind
 from .config import EvboxConfig

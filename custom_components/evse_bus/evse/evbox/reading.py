@@ -3,7 +3,8 @@
 from collections.abc import Mapping
 from typing import Final
 
-from ..model import UNKNOWN_PHASES, ChargerInfo, ConnectorReading, Phases
+from ..model import UNKNOWN_PHASES, Phases
+from ..readings import ChargerInfo, ConnectorReading
 from .frames import ModuleReply, Reply
 from .plausibility import Taken
 

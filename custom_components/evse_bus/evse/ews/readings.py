@@ -6,14 +6,8 @@ Pure functions. Manual, 3.2.4 (``rc``, ``rd``, ``rs``).
 from math import inf
 from typing import Final
 
-from ..model import (
-    MINIMUM_CURRENT,
-    Capability,
-    ChargerInfo,
-    ChargerReading,
-    ConnectorReading,
-    Limits,
-)
+from ..model import MINIMUM_CURRENT, Capability, Limits
+from ..readings import ChargerInfo, ChargerReading, ConnectorReading
 from .box import BoxStatus
 from .session import Installation, Told
 from .states import CHARGING, PAUSED_OPTIMISED, WAITING, box_faults, port_state

@@ -2,14 +2,8 @@
 
 from typing import Final
 
-from ..model import (
-    Capability,
-    ChargerInfo,
-    ChargerReading,
-    ConnectorReading,
-    Setting,
-    Status as Word,
-)
+from ..model import Capability, Setting, Status as Word
+from ..readings import ChargerInfo, ChargerReading, ConnectorReading
 from .dialects import MAPS, Dialect
 from .registers import Configuration, Status
 from .states import UNPLUGGED, offered, state_of, tells_plug, word_of

@@ -1,0 +1,95 @@
+"""What chargers tell: of themselves, and of each connector.
+
+Units throughout: ampere, volt, watt, watt-hour, second. ``None`` means "not told".
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from .model import UNKNOWN_PHASES, Fault, Mode, Phases, Setting, Status
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConnectorReading:
+    """What a charger told of one connector (EVBox: one ChargeBox module)."""
+
+    status: Status | None = None
+    raw_state: str | None = None
+    """The charger's own word: an IEC 61851 state such as ``C2``."""
+    plugged: bool | None = None
+    charging: bool | None = None
+    current: Phases[float | None] = UNKNOWN_PHASES
+    """Used current, A."""
+    voltage: Phases[float | None] = UNKNOWN_PHASES
+    cos_phi: Phases[float | None] = UNKNOWN_PHASES
+    power: float | None = None
+    """Power from measured voltage, current and cos phi, W."""
+    energy: float | None = None
+    """Meter total, Wh."""
+    meter_generation: int = 0
+    """Counts up when another meter may be behind this number (EVBox: modules have
+    no identity): a total must not be carried over such a change."""
+    estimated_power: float | None = None
+    """Power from measured current and a configured voltage, W."""
+    estimated_energy: float | None = None
+    """Estimated power summed since this object began to listen, Wh."""
+    minimum_current: float | None = None
+    """Current below which this connector cannot charge, A."""
+    session_energy: float | None = None
+    """Of the charge under way, Wh."""
+    session_time: int | None = None
+    """Of the charge under way, s."""
+    last_session_energy: float | None = None
+    """Of the last charge, Wh."""
+    last_session_time: int | None = None
+    """Of the last charge, s."""
+    cable_current: float | None = None
+    """Rated current of the cable, A."""
+    locked: bool | None = None
+    """The plug is locked."""
+    contactor: bool | None = None
+    """The contactor is closed."""
+    optimised: bool | None = None
+    """The next start is an optimised one."""
+    start_requested: bool | None = None
+    """Somebody wants to charge, and waits for our permission."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChargerReading:
+    """What a charger told of itself and of its connectors."""
+
+    connectors: Mapping[int, ConnectorReading] = field(default_factory=dict)
+    """By number, 1..n."""
+    allowed: bool | None = None
+    """Whether the charger lets a car charge, as the charger says it."""
+    offered_current: float | None = None
+    """Current offered to the car now, A; 0: charging is paused."""
+    maximum_current: float | None = None
+    """Maximum of the connection or the box, A."""
+    minimum_interval: float | None = None
+    """The charger does not want to be asked more often than this, s."""
+    outlet_enabled: bool | None = None
+    mode: Mode | None = None
+    temperature: float | None = None
+    """Inside the box, degrees Celsius."""
+    settings: Mapping[Setting, int] = field(default_factory=dict)
+    """What is set in its own memory, as far as it was read."""
+    faults: frozenset[Fault] = frozenset()
+    fault_codes: tuple[str, ...] = ()
+    """The charger's own codes for its faults, raw (``F9``)."""
+    details: Mapping[str, str | int | float | bool | None] = field(default_factory=dict)
+    """More that the charger told, for diagnostics only."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChargerInfo:
+    """What a charger is; does not change while it runs."""
+
+    manufacturer: str
+    model: str
+    serial: str | None = None
+    firmware: str | None = None
+    hardware: str | None = None
+    options: Mapping[str, str | int | bool | None] = field(default_factory=dict)
+    """Configuration bits the charger told, by name."""
