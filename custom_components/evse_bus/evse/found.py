@@ -9,12 +9,15 @@ from .readings import ChargerInfo
 class FoundCharger:
     """A charger that answered a scan."""
 
-    address: int
+    address: int | str
+    """Where it is on its bus; of a box that is alone there, its serial number."""
     info: ChargerInfo
     serial: str | None = None
     maximum_current: float | None = None
     """Maximum that it told, A."""
     connectors: int = 1
+    maximum_currents: tuple[float | None, ...] = ()
+    """Of each port, where a box has ports of its own, A."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -79,6 +79,23 @@ class Fault(StrEnum):
     WRONG_CHARGER = "wrong_charger"
     DUPLICATE_ADDRESS = "duplicate_address"
     IMPLAUSIBLE = "implausible"
+    NO_SUCH_PORT = "no_such_port"
+    """The box has fewer ports than it is set up with."""
+
+
+class SessionResult(StrEnum):
+    """How a charge has ended (P-CHARGE EWS-Box, 3.2.4 rc)."""
+
+    STOPPED = "stopped"
+    """By the user or by us."""
+    PILOT_LOST = "pilot_lost"
+    """The cable was pulled at the car: not a fault."""
+    CABLE_LOST = "cable_lost"
+    RCD = "rcd"
+    METER = "meter"
+    SERVER_TIMEOUT = "server_timeout"
+    VENTILATION = "ventilation"
+    PILOT_UNSTABLE = "pilot_unstable"
 
 
 class Capability(StrEnum):
@@ -117,6 +134,14 @@ class Capability(StrEnum):
     CONTACTOR = "contactor"
     OPTIMISED = "optimised"
     START_REQUEST = "start_request"
+    RCD = "rcd"
+    VENTILATION = "ventilation"
+    PILOT_VOLTAGE = "pilot_voltage"
+    CARDS = "cards"
+    KEYS = "keys"
+    """Its keys are told as they are pressed."""
+    SERVER = "server"
+    """It says whether it is connected to its server."""
 
 
 class Persistence(StrEnum):
@@ -150,6 +175,8 @@ class Command(StrEnum):
     """As if the start key of the charger was pressed."""
     LOCK = "lock"
     """Lock the plug of a car that waits for its start."""
+    UNLOCK = "unlock"
+    """Unlock the plug; a charge under way is ended."""
     SET_OPTIMISED = "set_optimised"
     """Value: bool, the next start is an optimised one."""
 

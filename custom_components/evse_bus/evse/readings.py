@@ -5,8 +5,9 @@ Units throughout: ampere, volt, watt, watt-hour, second. ``None`` means "not tol
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from datetime import datetime
 
-from .model import UNKNOWN_PHASES, Fault, Mode, Phases, Setting, Status
+from .model import UNKNOWN_PHASES, Fault, Mode, Phases, SessionResult, Setting, Status
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,6 +44,12 @@ class ConnectorReading:
     """Of the last charge, Wh."""
     last_session_time: int | None = None
     """Of the last charge, s."""
+    last_result: SessionResult | None = None
+    """How the last charge ended."""
+    last_end: datetime | None = None
+    """When the last charge ended, by the clock of the box, without a zone."""
+    user: str | None = field(default=None, repr=False)
+    """Who has logged in with a card."""
     cable_current: float | None = None
     """Rated current of the cable, A."""
     locked: bool | None = None
@@ -53,6 +60,15 @@ class ConnectorReading:
     """The next start is an optimised one."""
     start_requested: bool | None = None
     """Somebody wants to charge, and waits for our permission."""
+    rcd_tripped: bool | None = None
+    ventilation_requested: bool | None = None
+    """The car wants the room to be ventilated."""
+    pilot_low: float | None = None
+    """Lowest level of the control pilot, V."""
+    pilot_high: float | None = None
+    """Highest level of the control pilot, V."""
+    proximity_voltage: float | None = None
+    """At the contact that tells of the cable, V."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,6 +87,9 @@ class ChargerReading:
     """The charger does not want to be asked more often than this, s."""
     outlet_enabled: bool | None = None
     mode: Mode | None = None
+    server_connected: bool | None = None
+    """The box says that it is connected to its server."""
+    ventilating: bool | None = None
     temperature: float | None = None
     """Inside the box, degrees Celsius."""
     settings: Mapping[Setting, int] = field(default_factory=dict)

@@ -120,11 +120,11 @@ def _report(config: EvboxConfig, heard: _Heard) -> ScanReport:
     found: dict[int, FoundCharger] = {}
     duplicates: set[int] = set()
     for reply in heard.replies:
-        one = _found(config, reply)
-        if one.address in found:
-            duplicates.add(one.address)
+        address = _address(config, reply)
+        if address in found:
+            duplicates.add(address)
         else:
-            found[one.address] = one
+            found[address] = _found(address, reply)
     if heard.bad_frames and config.addressed == ANY_SERIAL:
         duplicates.add(ANY_SERIAL)
     return ScanReport(
@@ -134,10 +134,14 @@ def _report(config: EvboxConfig, heard: _Heard) -> ScanReport:
     )
 
 
-def _found(config: EvboxConfig, reply: Reply) -> FoundCharger:
+def _address(config: EvboxConfig, reply: Reply) -> int:
     serial = serial_number(reply)
     # A serial number that is no number cannot be addressed.
-    address = int(serial) if serial and serial.isdecimal() else config.address
+    return int(serial) if serial and serial.isdecimal() else config.address
+
+
+def _found(address: int, reply: Reply) -> FoundCharger:
+    serial = serial_number(reply)
     return FoundCharger(
         address=address,
         info=charger_info(serial),
