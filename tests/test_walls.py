@@ -15,9 +15,6 @@ EVSE = INTEGRATION / "evse"
 VIRTUAL = Path(__file__).parent / "virtual"
 PROTOCOLS = sorted(path.parent.name for path in EVSE.glob("*/charger.py"))
 
-NOT_OFFERED = {"ews"}
-"""Folders of protocols that are not in the registry."""
-
 PURE = (
     "frames",
     "registers",
@@ -148,4 +145,4 @@ def test_the_library_can_be_imported_without_home_assistant() -> None:
     )
     # A folder may speak in more than one role: ``smartevse``, ``smartevse_master``.
     folders = {key.split("_")[0] for key in done.stdout.split()}
-    assert sorted(folders | NOT_OFFERED) == PROTOCOLS
+    assert sorted(folders) == PROTOCOLS

@@ -39,6 +39,11 @@ class Protocol:
     """
     probe_imposes: bool = False
     """Every message sets limits, so a scan does too: ask for the values first."""
+    ports: int = 1
+    """Most ports that one box has, each a charger of its own (`ChargerConfig.address`
+    is its number); 1: a box is one charger."""
+    dials_in: bool = False
+    """The boxes dial us: there is a listener and no port, and a bus for each box."""
     duty: Callable[[Supply], Duty] | None = None
     """Home Assistant is the master of the bus: what that takes."""
 
@@ -52,8 +57,12 @@ class Protocol:
     ) -> Bus:
         """Return a bus of this protocol on a port; `Bus.start` opens it.
 
-        ``supply`` is what its chargers share, where the bus has a master.
+        ``supply`` is what its chargers share, where the bus has a master. Raises
+        TypeError where boxes dial us: then the listener makes the buses.
         """
+        if self.dials_in:
+            message = f"{self.name}: there is no port to open, a listener has its buses"
+            raise TypeError(message)
         line = Line(url, settings or self.settings)
         duty = self.duty(supply or Supply()) if self.duty is not None else None
         return Bus(line, self.framer(), self.timing, name, duty=duty)

@@ -4,9 +4,11 @@ from typing import Final
 
 from .abl import PROTOCOL as ABL
 from .evbox import PROTOCOL as EVBOX
+from .ews import NETWORK as EWS_NETWORK, PROTOCOL as EWS
 from .protocol import Protocol
 from .smartevse import MASTER as SMARTEVSE_MASTER, POLLED as SMARTEVSE
 
 PROTOCOLS: Final[dict[str, Protocol]] = {
-    protocol.key: protocol for protocol in (EVBOX, ABL, SMARTEVSE, SMARTEVSE_MASTER)
+    protocol.key: protocol
+    for protocol in (EVBOX, ABL, SMARTEVSE, SMARTEVSE_MASTER, EWS, EWS_NETWORK)
 }

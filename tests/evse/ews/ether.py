@@ -231,7 +231,7 @@ class EwsScene:
         return reading
 
     def connector(self, port: int = 1) -> ConnectorReading:
-        return self.reading(port).connectors[1]
+        return self.reading(port).connectors[port]
 
     def status(self, port: int = 1) -> int:
         return self.box.ports[port - 1].status

@@ -115,18 +115,28 @@ def test_the_reading_of_the_checksum_is_found(bcc: str) -> None:
     play(EwsScene(options={"bcc": bcc}), acts)
 
 
-def test_a_scan_finds_both_ports_and_writes_nothing() -> None:
+@pytest.mark.parametrize(
+    ("options", "ports", "second"),
+    [({}, 2, 20.0), ({"mode1": (False, True)}, 2, 16.0), ({"ports": 1}, 1, None)],
+    ids=["two-ports", "a-household-socket", "one-port"],
+)
+def test_a_scan_finds_the_box_and_writes_nothing(
+    options: dict[str, object], ports: int, second: float | None
+) -> None:
     async def run() -> None:
-        scene = EwsScene(ports=(), options={"bcc": "without_msgid", "max_current": 20})
+        known = {"bcc": "without_msgid", "max_current": 20}
+        scene = EwsScene(ports=(), options=known | options)
         life = asyncio.create_task(scene._live())
         await scene.bus.start()
         done: list[float] = []
         config = scene.make_charger(1).config
         orders = scene.make_charger(1).orders
         report = await PROTOCOL.scan(scene.bus, config, orders, done.append)
-        assert [one.address for one in report.found] == [1, 2]
-        assert {one.serial for one in report.found} == {SERIAL}
-        assert {one.maximum_current for one in report.found} == {20.0}
+        (found,) = report.found
+        assert found.address == found.serial == found.info.serial == SERIAL
+        assert found.connectors == ports
+        assert found.maximum_currents == (20.0, second)[:ports]
+        assert found.maximum_current == min(20.0, second or 20.0)
         assert done[-1] == 1.0
         scene.line.cut = True
         report = await PROTOCOL.scan(scene.bus, config, orders, done.append)

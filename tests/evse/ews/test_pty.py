@@ -53,7 +53,7 @@ def test_both_ports_on_a_pty() -> None:
             assert all(port.locked for port in box.ports)
             reading = ports[1].reading
             assert reading is not None
-            assert reading.connectors[1].status is Status.SUSPENDED_EVSE
+            assert reading.connectors[2].status is Status.SUSPENDED_EVSE
             bus.unplug()
             await until(lambda: not line.connected)
             bus.replug()

@@ -1,13 +1,15 @@
 """P-CHARGE EWS-Box: MCS binary over RS-232 or TCP, two charge ports a box."""
 
+from dataclasses import replace
 from typing import Final
 
 from ..protocol import Protocol
 from .charger import EwsPort
 from .config import EwsPortConfig
 from .frames import EwsFramer
+from .listener import Listener, Stranger
 from .scan import scan
-from .timing import SETTINGS, TIMING
+from .timing import SETTINGS, TCP_TIMING, TIMING
 
 PROTOCOL: Final = Protocol(
     key="ews",
@@ -18,7 +20,24 @@ PROTOCOL: Final = Protocol(
     config=EwsPortConfig,
     charger=EwsPort,
     scan=scan,
+    ports=2,
 )
-"""On RS-232; a box on the network dials a `listener.Listener`."""
+"""On RS-232."""
 
-__all__ = ["PROTOCOL", "EwsPort", "EwsPortConfig"]
+NETWORK: Final = replace(
+    PROTOCOL,
+    key="ews_network",
+    name="P-CHARGE EWS-Box, network",
+    timing=TCP_TIMING,
+    dials_in=True,
+)
+"""Over the network: boxes dial a `Listener`, which has a bus for each."""
+
+__all__ = [
+    "NETWORK",
+    "PROTOCOL",
+    "EwsPort",
+    "EwsPortConfig",
+    "Listener",
+    "Stranger",
+]

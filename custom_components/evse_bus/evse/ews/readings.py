@@ -6,12 +6,13 @@ Pure functions. Manual, 3.2.4 (``rc``, ``rd``, ``rs``).
 from math import inf
 from typing import Final
 
-from ..model import MINIMUM_CURRENT, Capability, Limits
+from ..model import MINIMUM_CURRENT, Capability, Limits, SessionResult
 from ..readings import ChargerInfo, ChargerReading, ConnectorReading
 from .box import BoxStatus
+from .parameters import SystemMode
 from .session import Installation, Told
 from .states import CHARGING, PAUSED_OPTIMISED, WAITING, box_faults, port_state
-from .status import PortStatus, StartRelease
+from .status import ChargeResult, PortFlags, PortStatus, StartRelease
 
 MODE_1_CURRENT: Final = 16
 """What a household socket carries, A: all or nothing (2.2.1)."""
@@ -19,7 +20,12 @@ RUNNING: Final = range(CHARGING, PAUSED_OPTIMISED + 1)
 """Status bytes of a charge under way, pauses included."""
 
 _MODE_3_ONLY: Final = frozenset(
-    {Capability.OFFERED_CURRENT, Capability.CABLE_CURRENT, Capability.LOCK}
+    {
+        Capability.OFFERED_CURRENT,
+        Capability.CABLE_CURRENT,
+        Capability.LOCK,
+        Capability.PILOT_VOLTAGE,
+    }
 )
 _ALL: Final = _MODE_3_ONLY | {
     Capability.STATUS,
@@ -35,18 +41,34 @@ _ALL: Final = _MODE_3_ONLY | {
     Capability.CONTACTOR,
     Capability.OPTIMISED,
     Capability.START_REQUEST,
+    Capability.RCD,
+    Capability.VENTILATION,
+    Capability.CARDS,
+    Capability.SERVER,
 }
 
 
 def capabilities_of(
     port: int, installation: Installation | None
 ) -> frozenset[Capability]:
-    """Return what a port has; mode 1 has no pilot, a fixed cable no lock."""
+    """Return what a port has; mode 1 has no pilot, a fixed cable no lock.
+
+    Cards are there unless the box says that it asks for none; its keys are told only
+    where they are the server's to watch (3.2.3).
+    """
     if installation is None:
         return _ALL
+    known = set(_ALL)
     if installation.mode_1[port - 1]:
-        return _ALL - _MODE_3_ONLY
-    return _ALL - {Capability.LOCK} if installation.fixed_cable else _ALL
+        known -= _MODE_3_ONLY
+    if installation.fixed_cable:
+        known.discard(Capability.LOCK)
+    mode = installation.mode
+    if mode is not None and SystemMode.CARDS not in mode:
+        known.discard(Capability.CARDS)
+    if mode is not None and SystemMode.MANUAL_IO in mode:
+        known.add(Capability.KEYS)
+    return frozenset(known)
 
 
 def limits_of(
@@ -92,7 +114,10 @@ def charger_info(box: BoxStatus) -> ChargerInfo:
 
 
 def charger_reading(port: int, box: Told, *, paused: bool) -> ChargerReading:
-    """Return a port's reading; ``paused``: it is our pause that it is in."""
+    """Return a port's reading; ``paused``: it is our pause that it is in.
+
+    Its connector has the number of the port: both are parts of one box.
+    """
     at = port - 1
     seen, details, installation = box.ports[at], box.details, box.installation
     state = port_state(seen, fixed_cable=installation.fixed_cable, paused=paused)
@@ -107,33 +132,44 @@ def charger_reading(port: int, box: Told, *, paused: bool) -> ChargerReading:
         session_time=seen.session_time,
         last_session_energy=float(seen.last_energy),
         last_session_time=seen.last_time,
+        last_result=_result(seen.result),
+        last_end=details.last_end[at],
+        user=(seen.card.user or None) if seen.card is not None else None,
         cable_current=float(seen.cable_current) if seen.cable_current else None,
         locked=state.locked,
         contactor=seen.contactor,
         optimised=seen.optimised,
         start_requested=seen.start is StartRelease.REQUESTED,
+        rcd_tripped=seen.rcd_tripped,
+        ventilation_requested=PortFlags.VENTILATION in seen.flags,
+        pilot_low=seen.pwm_minimum,
+        pilot_high=seen.pwm_maximum,
+        proximity_voltage=seen.cable_voltage,
     )
     offered = 0 if paused else seen.offered_current
     told = limits_of(port, inf, box.status, installation, None).reported
     return ChargerReading(
-        connectors={1: connector},
+        connectors={port: connector},
         allowed=_allowed(seen, paused=paused),
         offered_current=None if offered is None else float(offered),
         maximum_current=told,
+        server_connected=box.status.server_connected,
+        ventilating=box.status.ventilating,
         faults=state.faults | box_faults(box.status),
         details={
             "limit": details.limit[at],
             "pwm_duty": details.pwm_duty[at],
             "pilot_code": details.pilot_code[at],
             "cable_code": details.cable_code[at],
-            "pwm_minimum": seen.pwm_minimum,
-            "pwm_maximum": seen.pwm_maximum,
-            "cable_voltage": seen.cable_voltage,
             "start_code": seen.start_code,
             "result_code": seen.result_code,
             "meter_cycles": seen.meter_cycles,
         },
     )
+
+
+def _result(told: ChargeResult | None) -> SessionResult | None:
+    return None if told is None else SessionResult[told.name]
 
 
 def _allowed(seen: PortStatus, *, paused: bool) -> bool | None:

@@ -1,10 +1,11 @@
 """Looking for an EWS-Box on a bus; nothing is written.
 
-There is one box on a line, and its ports are its chargers. ``id`` is asked under both
-readings of the checksum (manual, 3.2.2).
+There is one box on a line: it is found by its serial number, whichever ports it has.
+``id`` is asked under both readings of the checksum (manual, 3.2.2).
 """
 
 from functools import partial
+from math import inf
 from typing import TYPE_CHECKING, Final
 
 from ..errors import (
@@ -66,15 +67,17 @@ def _found(box: EwsBox) -> tuple[FoundCharger, ...]:
     status, installation = box.status, box.installation
     if status is None or installation is None:
         return ()
-    info = charger_info(status)
-    return tuple(
-        FoundCharger(
-            address=port,
-            info=info,
-            serial=status.serial,
-            maximum_current=limits_of(
-                port, float("inf"), status, installation, None
-            ).reported,
-        )
+    each = tuple(
+        limits_of(port, inf, status, installation, None).reported
         for port in range(1, installation.ports + 1)
+    )
+    return (
+        FoundCharger(
+            address=status.serial,
+            info=charger_info(status),
+            serial=status.serial,
+            maximum_current=min((one for one in each if one is not None), default=None),
+            connectors=installation.ports,
+            maximum_currents=each,
+        ),
     )
