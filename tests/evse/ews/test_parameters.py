@@ -2,7 +2,7 @@
 
 from ipaddress import IPv4Address
 
-from hypothesis import given, strategies as st
+from hypothesis import assume, given, strategies as st
 import pytest
 
 from custom_components.evse_bus.evse.errors import (
@@ -236,6 +236,15 @@ def test_a_box_without_ports_is_not_believed() -> None:
 )
 def test_whether_a_secret_was_read(secret: bytes, told: Shown) -> None:
     assert shown(secret) is told
+
+
+@given(st.binary(min_size=12, max_size=12))
+def test_whether_a_secret_was_read_can_be_said_later(secret: bytes) -> None:
+    text = secret.split(b"\0")[0].decode("latin-1")
+    # Spaces around a text are not kept.
+    assume(text == text.strip())
+    told = USER_BLOCK.decode(secret + USER[12:])
+    assert USER_BLOCK.secrets_told(told) == {"user_password": shown(secret)}
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,10 @@
 """Cards, meter, LEDs, parameters and firmware, on the virtual box."""
 
 import asyncio
+from contextlib import nullcontext
 from datetime import UTC, datetime
+from functools import partial
+from unittest.mock import patch
 from zoneinfo import ZoneInfo
 
 import pytest
@@ -24,9 +27,12 @@ from custom_components.evse_bus.evse.ews.parameters import (
     INSTALLATION_BLOCK,
     SYSTEM_BLOCK,
     USER_BLOCK,
+    HiddenSecretError,
     SystemMode,
+    SystemParameters,
 )
 from custom_components.evse_bus.evse.ews.timing import TCP_TIMING
+from tests.virtual.ews_parameters import SystemParameters as VirtualParameters
 from tests.virtual.ews_rfid import Card
 
 from .ether import EwsScene, play
@@ -202,6 +208,99 @@ def test_what_the_box_keeps_as_it_was_is_told() -> None:
             await scene.charger().services.change_parameters(
                 SYSTEM_BLOCK, {"mode": mode}
             )
+
+    play(EwsScene(), acts)
+
+
+def test_one_bit_is_changed_in_what_stands_there() -> None:
+    async def acts(scene: EwsScene) -> None:
+        scene.box.system.admin_password = b"geheim".ljust(12, b"\0")
+        scene.box.system.card_pin = b"4711"
+        seen: list[SystemMode] = []
+
+        def exclusive(told: SystemParameters) -> dict[str, object]:
+            # Somebody else has changed a bit since we read it last.
+            seen.append(told.mode)
+            return {"mode": SystemMode(told.mode.value | SystemMode.EXCLUSIVE.value)}
+
+        before = scene.box.system.mode
+        scene.box.system.mode ^= SystemMode.CARDS.value
+        told = await scene.charger().services.change_parameters(SYSTEM_BLOCK, exclusive)
+        assert seen == [SystemMode(before ^ SystemMode.CARDS.value)]
+        assert told.mode == seen[0] | SystemMode.EXCLUSIVE
+        assert scene.box.system.mode == told.mode.value
+        assert [one.name for one in scene.line.named("rp", "sp")][-3:-1] == ["rp", "sp"]
+
+    play(EwsScene(), acts)
+
+
+def test_bits_that_nobody_knows_do_not_hold_up_a_change() -> None:
+    async def acts(scene: EwsScene) -> None:
+        scene.box.system.admin_password = b"geheim".ljust(12, b"\0")
+        scene.box.system.card_pin = b"4711"
+        # The virtual box refuses what its manual does not know; a later one may not.
+        scene.box.system.mode |= 0x80
+        with patch.object(scene.box.system, "write", partial(take, scene.box.system)):
+            told = await scene.charger().services.change_parameters(
+                SYSTEM_BLOCK,
+                lambda told: {
+                    "mode": SystemMode(told.mode.value | SystemMode.EXCLUSIVE.value)
+                },
+            )
+        assert told.mode.value & 0x90 == 0x90
+        assert scene.box.system.mode & 0x90 == 0x90
+
+    def take(system: VirtualParameters, block: bytes, *, network: bool) -> int:
+        assert not network
+        system.mode = block[13]
+        return 0
+
+    play(EwsScene(), acts)
+
+
+def test_all_hidden_secrets_are_named() -> None:
+    async def acts(scene: EwsScene) -> None:
+        with pytest.raises(HiddenSecretError) as told:
+            await scene.charger().services.change_parameters(
+                SYSTEM_BLOCK, {"maximum_current": 20}
+            )
+        assert told.value.names == ("admin_password", "card_pin")
+
+    play(EwsScene(options={"masking": "stars"}), acts)
+
+
+@pytest.mark.parametrize("masking", ["no", "stars"])
+@pytest.mark.parametrize("lost", ["nothing", "answer", "command"])
+def test_a_password_that_may_not_have_been_taken_is_told(
+    masking: str, lost: str
+) -> None:
+    """Where the box tells it, it is read back; else only the answer says so."""
+
+    async def acts(scene: EwsScene) -> None:
+        scene.box.user.user_password = b"geheim".ljust(12, b"\0")
+        if lost == "answer":
+            scene.line.mute = lambda name: name == "su"
+        elif lost == "command":
+            scene.line.deaf = lambda name: name == "su"
+        change = scene.charger().services.change_parameters(
+            USER_BLOCK, {"user_password": "anders"}
+        )
+        known = lost == "nothing" or (lost == "answer" and masking == "no")
+        with nullcontext() if known else pytest.raises(NotConfirmedError):
+            await change
+        assert len(scene.line.named("su")) == 1
+        taken = scene.box.user.user_password.rstrip(b"\0")
+        assert taken == (b"geheim" if lost == "command" else b"anders")
+
+    play(EwsScene(options={"masking": masking}), acts)
+
+
+def test_a_text_with_spaces_around_it_is_known_again() -> None:
+    async def acts(scene: EwsScene) -> None:
+        told = await scene.charger().services.change_parameters(
+            INSTALLATION_BLOCK, {"name": " Max "}
+        )
+        assert told.name == "Max"
 
     play(EwsScene(), acts)
 

@@ -13,15 +13,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import KEEP, Enum, IntEnum, IntFlag
 from ipaddress import IPv4Address
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from ..errors import RefusedOrderError
 from .fields import Address, Ascii, Bits, Flag, Number, Raw, Text
 from .frames import CommandId, Request
 from .structs import Struct
-
-if TYPE_CHECKING:
-    from .fields import Field
 
 _ANY_BYTE: Final = range(256)
 _LIMIT: Final = (0, *range(6, 81))
@@ -236,6 +233,18 @@ EXTRA: Final = Struct(
 # -- Changing ----------------------------------------------------------------------
 
 
+class HiddenSecretError(RefusedOrderError):
+    """A block that was not written, since that would erase what the box hides."""
+
+    def __init__(self, source: str, names: tuple[str, ...]) -> None:
+        """Keep the names of the secrets."""
+        super().__init__(
+            f"{source}: the box does not tell {', '.join(names)}; writing would erase "
+            "what is not named as well"
+        )
+        self.names = names
+
+
 class Shown(Enum):
     """What stands where a block has a secret."""
 
@@ -271,32 +280,37 @@ class Block[T]:
         """Return what the answer to the read says; raises ImplausibleReplyError."""
         return self.struct.decode(data)
 
+    def secrets_told(self, told: T) -> dict[str, Shown]:
+        """Return what was read in the place of each secret."""
+        # No sign that could not be read is one byte of UTF-8, so it stays unreadable.
+        return {
+            name: shown(getattr(told, name).encode()) for name in sorted(self.secrets)
+        }
+
     def change(self, data: bytes, changes: Mapping[str, object]) -> Request:
         """Return the command that writes a block just read, with these changes.
 
-        Raises RefusedOrderError for a field or value that cannot be, for nothing to
-        change, and where a secret would be erased; ImplausibleReplyError for
-        bytes that are no such block.
+        Raises RefusedOrderError for a field or value that cannot be and for nothing
+        to change, HiddenSecretError where a secret would be erased,
+        ImplausibleReplyError for bytes that are no such block.
         """
         if not changes:
             message = f"{self.struct.source}: nothing to change"
             raise RefusedOrderError(message)
         changed = self.struct.changed(data, changes)
+        hidden = []
         at = 0
         for known in self.struct.fields:
-            if known.name in self.secrets - changes.keys():
-                self._check(known, data[at : at + known.width])
+            secret = data[at : at + known.width]
             at += known.width
+            if (
+                known.name in self.secrets - changes.keys()
+                and shown(secret) is not Shown.SHOWN
+            ):
+                hidden.append(known.name)
+        if hidden:
+            raise HiddenSecretError(self.struct.source, tuple(hidden))
         return Request(self.write, changed)
-
-    def _check(self, known: Field[object], secret: bytes) -> None:
-        told = shown(secret)
-        if told is not Shown.SHOWN:
-            message = (
-                f"{self.struct.source}: the box does not tell {known.name} "
-                f"({told.value}); writing would erase it unless it is named as well"
-            )
-            raise RefusedOrderError(message)
 
 
 SYSTEM_BLOCK: Final = Block(

@@ -30,7 +30,7 @@ from .commands import (
     set_meter,
 )
 from .frames import CommandId, Request
-from .parameters import Block
+from .parameters import Block, Shown
 from .timing import LOOK_AGAIN
 
 if TYPE_CHECKING:
@@ -81,7 +81,10 @@ class Services:
             await self._tell(talk, CommandId.WRITE_CARDS, write_cards(cards))
 
         return await self._write_and_read(
-            write, self._read_cards, lambda cards: cards == wanted[-1], "its card list"
+            write,
+            self._read_cards,
+            lambda cards: cards == wanted[-1],
+            lambda: "its card list",
         )
 
     async def _read_cards(self, talk: Talk) -> CardList:
@@ -145,36 +148,49 @@ class Services:
         )
 
     async def change_parameters[T](
-        self, block: Block[T], changes: Mapping[str, object]
+        self,
+        block: Block[T],
+        changes: Mapping[str, object] | Callable[[T], Mapping[str, object]],
     ) -> T:
         """Change fields of a block, and nothing else; return it (``sp su si sz``).
 
-        It is read, changed and written in one turn, then read back. Raises
-        RefusedOrderError where a password would be erased that the box hides,
+        It is read, changed and written in one turn, then read back. ``changes`` may
+        be made of what stands there, for single bits of a field. Raises
+        HiddenSecretError where a password would be erased that the box hides,
         NotConfirmedError when a field is not read back so (over the network a box
-        keeps its server mode).
+        keeps its server mode), or when a secret that the box hides got no answer.
         """
         box = self._port.box
+        wanted: dict[str, object] = {}
+        answered = False
 
         async def write(talk: Talk) -> None:
+            nonlocal answered
             raw = await box.read(talk, block.read, bytes)
-            await self._tell(talk, block.write, block.change(raw, changes))
+            wanted.update(
+                changes if isinstance(changes, Mapping) else changes(block.decode(raw))
+            )
+            answered = await self._tell(talk, block.write, block.change(raw, wanted))
 
         def stands(told: T) -> bool:
+            secrets = block.secrets_told(told)
             return all(
-                getattr(told, name) == value
-                for name, value in changes.items()
-                if name not in block.secrets
+                # What is hidden has only the answer for a witness.
+                (answered and secrets.get(name, Shown.SHOWN) is not Shown.SHOWN)
+                or getattr(told, name) == _as_read(value)
+                for name, value in wanted.items()
             )
 
-        result = await self._write_and_read(
-            write,
-            lambda talk: box.read(talk, block.read, block.decode),
-            stands,
-            ", ".join(sorted(changes.keys() - block.secrets)) or "its secrets",
-        )
-        box.parameters_due = float("-inf")
-        return result
+        try:
+            return await self._write_and_read(
+                write,
+                lambda talk: box.read(talk, block.read, block.decode),
+                stands,
+                lambda: ", ".join(sorted(wanted)),
+            )
+        finally:
+            # Also where not all of it was taken: some of it may stand there.
+            box.parameters_due = float("-inf")
 
     # -- Turns -----------------------------------------------------------------------
 
@@ -208,19 +224,23 @@ class Services:
             return None
         return bus.worst_case(self._port) + patience
 
-    async def _tell(self, talk: Talk, command: CommandId, request: Request) -> None:
-        """Write; a lost answer decides nothing, what is read back does."""
+    async def _tell(self, talk: Talk, command: CommandId, request: Request) -> bool:
+        """Write; return whether it was answered.
+
+        A lost answer decides nothing, what is read back does.
+        """
         try:
             await self._port.box.tell(talk, command, lambda: request)
         except ReplyTimeoutError:
-            return
+            return False
+        return True
 
     async def _write_and_read[T](
         self,
         write: Callable[[Talk], Awaitable[None]],
         read: Callable[[Talk], Awaitable[T]],
         stands: Callable[[T], bool],
-        what: str,
+        what: Callable[[], str],
     ) -> T:
         """Write in one turn, then read until it stands there.
 
@@ -244,8 +264,13 @@ class Services:
                 if stands(found):
                     told.append(found)
                     return
-            message = f"{port.config.name} did not take {what}"
+            message = f"{port.config.name} did not take {what()}"
             raise NotConfirmedError(message)
 
         await port.run(in_turns(talks))
         return told[0]
+
+
+def _as_read(value: object) -> object:
+    """Return a value as it is read back: texts come without spaces around them."""
+    return value.strip() if isinstance(value, str) else value
