@@ -30,14 +30,17 @@ MOST_BYTES: Final = 8 * LONGEST_FRAME
 class Connection(asyncio.Protocol):
     """One accepted connection; its bytes go to a line, or wait for one."""
 
-    def __init__(self, made: Callable[[Connection], None]) -> None:
-        """Call ``made`` when the connection stands."""
+    def __init__(
+        self,
+        made: Callable[[Connection], None],
+        gone: Callable[[Connection], None],
+    ) -> None:
+        """Call ``made`` when the connection stands, and ``gone`` when it has ended."""
         self._made = made
+        self._gone = gone
         self._transport: asyncio.Transport | None = None
         self._waiting = b""
         self.line: AcceptedLine | None = None
-        self.on_gone: Callable[[], None] = lambda: None
-        """Called when it has ended."""
         self.peer: Address | None = None
 
     @property
@@ -108,7 +111,7 @@ class Connection(asyncio.Protocol):
         line, self.line = self.line, None
         if line is not None:
             line.lost(error)
-        self.on_gone()
+        self._gone(self)
 
 
 def _address(peer: object) -> Address | None:

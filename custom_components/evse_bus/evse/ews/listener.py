@@ -7,7 +7,7 @@ connected and answers keeps its connection, and addresses can be restricted.
 """
 
 import asyncio
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 import errno
@@ -96,7 +96,12 @@ class Listener:
         self._server: asyncio.Server | None = None
         self._buses: dict[str, Bus] = {}
         self._unidentified: dict[Connection, float] = {}
+        self._identified: dict[Connection, Stranger] = {}
+        """All others that are open, whatever became of them."""
         self._strangers: dict[str, Connection] = {}
+        self._bound: dict[str, Connection] = {}
+        """Those that belong to the bus of a box."""
+        self._timers: dict[Connection, asyncio.TimerHandle] = {}
         self._tasks: set[asyncio.Task[None]] = set()
         self._asking: set[str] = set()
         self._warned: set[str] = set()
@@ -119,9 +124,11 @@ class Listener:
         loop = asyncio.get_running_loop()
         try:
             self._server = await loop.create_server(
-                lambda: Connection(self._on_connection), self.host, self.port
+                lambda: Connection(self._on_connection, self._on_gone),
+                self.host,
+                self.port,
             )
-        except (OSError, OverflowError) as error:
+        except (OSError, OverflowError, ValueError) as error:
             raise _error(error) from error
         self.port = self._server.sockets[0].getsockname()[1]
 
@@ -130,16 +137,26 @@ class Listener:
         server, self._server = self._server, None
         if server is not None:
             server.close()
+        bound = set(self._bound.values())
+        for connection in {*self._unidentified, *self._identified} - bound:
+            connection.abort()
         tasks = tuple(self._tasks)
         for task in tasks:
             task.cancel()
         for task in tasks:
             with suppress(asyncio.CancelledError):
                 await task
-        for connection in (*self._unidentified, *self._strangers.values()):
-            connection.abort()
-        self._unidentified.clear()
-        self._strangers.clear()
+
+    def allow(self, networks: Iterable[Network]) -> None:
+        """Let only these networks connect from now on; none: all may.
+
+        Connections from elsewhere end at once, also those of boxes that are set up.
+        """
+        self.allowed = tuple(networks)
+        for connection in (*self._unidentified, *self._identified):
+            if not self._is_allowed(connection.peer):
+                self.statistics.not_allowed += 1
+                connection.abort()
 
     # -- Boxes that are set up -------------------------------------------------------
 
@@ -154,8 +171,9 @@ class Listener:
         framer = EwsFramer()
         line = AcceptedLine(f"EWS-Box {serial}", lambda: framer.noise)
         bus = self._buses[serial] = Bus(line, framer, TCP_TIMING, name)
-        stranger = self._strangers.pop(serial, None)
-        if stranger is not None and stranger.is_open:
+        if (stranger := self._strangers.pop(serial, None)) is not None:
+            self._keep_for_good(stranger)
+            self._bound[serial] = stranger
             line.attach(stranger)
         return bus
 
@@ -166,6 +184,31 @@ class Listener:
             await bus.stop()
 
     # -- Who is there ----------------------------------------------------------------
+
+    @property
+    def strangers(self) -> tuple[Stranger, ...]:
+        """Return the boxes that are connected now and not set up."""
+        return tuple(self._identified[one] for one in self._strangers.values())
+
+    @property
+    def peers(self) -> Mapping[str, Address | None]:
+        """Return from where the boxes that are set up are connected now, by number."""
+        return {serial: one.peer for serial, one in self._bound.items()}
+
+    def _on_gone(self, connection: Connection) -> None:
+        self._unidentified.pop(connection, None)
+        self._keep_for_good(connection)
+        known = self._identified.pop(connection, None)
+        if known is None:
+            return
+        for table in (self._strangers, self._bound):
+            if table.get(known.serial) is connection:
+                del table[known.serial]
+
+    def _keep_for_good(self, connection: Connection) -> None:
+        """Stop the timer that would end a connection."""
+        if (timer := self._timers.pop(connection, None)) is not None:
+            timer.cancel()
 
     def _on_connection(self, connection: Connection) -> None:
         if self._server is None or not self._is_allowed(connection.peer):
@@ -195,7 +238,6 @@ class Listener:
         if asyncio.get_running_loop().time() - since < GRACE:
             return False
         self.statistics.crowded_out += 1
-        del self._unidentified[oldest]
         oldest.abort()
         return True
 
@@ -208,8 +250,8 @@ class Listener:
             self.statistics.unidentified += 1
             connection.abort()
             return
-        finally:
-            self._unidentified.pop(connection, None)
+        self._unidentified.pop(connection, None)
+        self._identified[connection] = stranger
         if (bus := self._buses.get(stranger.serial)) is None:
             self._keep_stranger(stranger, connection)
         elif await self._may_replace(stranger, bus, connection):
@@ -218,28 +260,19 @@ class Listener:
     def _keep_stranger(self, stranger: Stranger, connection: Connection) -> None:
         self.statistics.strangers += 1
         serial = stranger.serial
-        if (before := self._strangers.pop(serial, None)) is not None:
+        if (before := self._strangers.get(serial)) is not None:
             before.abort()
         if len(self._strangers) >= MOST_STRANGERS:
             connection.abort()
         else:
             self._strangers[serial] = connection
-
-            def gone() -> None:
-                if self._strangers.get(serial) is connection:
-                    del self._strangers[serial]
-
-            connection.on_gone = gone
-            loop = asyncio.get_running_loop()
-            loop.call_later(STRANGER_TIME, self._end_stranger, serial, connection)
+            self._timers[connection] = asyncio.get_running_loop().call_later(
+                STRANGER_TIME, connection.abort
+            )
         try:
             self.on_stranger(stranger)
         except Exception:
             _LOGGER.exception("A listener failed")
-
-    def _end_stranger(self, serial: str, connection: Connection) -> None:
-        if self._strangers.get(serial) is connection:
-            connection.abort()
 
     async def _may_replace(
         self, stranger: Stranger, bus: Bus, connection: Connection
@@ -277,7 +310,7 @@ class Listener:
             connection.abort()
             return
         self._warned.discard(serial)
-        connection.on_gone = lambda: None
+        self._bound[serial] = connection
         bus.line.attach(connection)
         bus.look_again()
 
@@ -323,7 +356,8 @@ def _error(error: Exception) -> LineError:
     code = getattr(error, "errno", None)
     if code == errno.EADDRINUSE:
         return PortBusyError(str(error))
-    # None of a host's addresses being ours comes without a code.
-    if code in (errno.EADDRNOTAVAIL, None):
+    # None of a host's addresses being ours comes without a code, as does what is no
+    # host; a link-local address without its interface (fe80::1%eth0) is invalid.
+    if code in (errno.EADDRNOTAVAIL, errno.EINVAL, None):
         return PortMissingError(str(error))
     return line_error(error)

@@ -13,6 +13,7 @@ from ..errors import NotAvailableError, WrongChargerError
 from ..exchange import Talk
 from ..model import Capability, ChargerConfig, Fault, Limits, Orders
 from ..turns import Turns
+from .accepted import AcceptedLine
 from .config import ews_config
 from .events import (
     ChargeEnded,
@@ -186,6 +187,9 @@ class EwsReader(Charger):
         )
         if expected is not None and found is not None and found != expected:
             self.set_unavailable()
+            if self.bus is not None and isinstance(self.bus.line, AcceptedLine):
+                # It would keep out the one whose number it gave when it dialled.
+                self.bus.line.end("another box answers")
             message = f"{self.config.name}: {found} answers, not {expected}"
             raise WrongChargerError(message, expected=expected, found=found)
 
