@@ -25,6 +25,7 @@ from pytest_homeassistant_custom_component.common import MockConfigEntry
 from custom_components.evse_bus.const import DOMAIN, SUBENTRY_CHARGER
 from tests.virtual import AblBox, EvboxChargePoint, SmartEvse, VirtualBus
 from tests.virtual.device import Device
+from tests.virtual.ews_box import EwsBox
 
 PATIENCE = 15.0
 """Longest time a virtual charger may take to be seen, s."""
@@ -34,12 +35,13 @@ _EXTRA: dict[str, dict[str, Any]] = {
     "evbox": {"command": 68, "information": "00" * 16, "fail_safe_timeout": 60},
     "smartevse": {},
     "smartevse_master": {},
+    "ews": {"ports": 2, "installation_limit_2": 16.0},
 }
 
 
 def charger(
     protocol: str,
-    address: int,
+    address: int | str,
     *,
     serial: str | None = None,
     title: str | None = None,
@@ -111,9 +113,17 @@ def charger_of(device: Device, **data: object) -> ConfigSubentryDataWithId:
         return charger("abl", device.device_id, serial=device.serial, **data)
     if isinstance(device, SmartEvse):
         return charger(protocol_of(device), device.unit, **data)
+    if isinstance(device, EwsBox):
+        return ews_charger(device, **data)
     assert isinstance(device, EvboxChargePoint)
     number = int(device.serial)
     return charger("evbox", number, serial=str(number), **data)
+
+
+def ews_charger(box: EwsBox, **data: object) -> ConfigSubentryDataWithId:
+    """Return the subentry of a virtual EWS-Box; its ports are chargers of their own."""
+    made = charger("ews", box.serial, serial=box.serial, title="Yard", **data)
+    return {**made, "subentry_id": f"ews{box.serial[-2:]}"}
 
 
 def protocol_of(device: Device) -> str:

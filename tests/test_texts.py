@@ -9,8 +9,10 @@ import pytest
 from custom_components.evse_bus import (
     binary_sensor,
     button,
+    event as events,
     number_tables,
     select as selects,
+    sensor_counts,
     sensor_tables,
     switch as switches,
 )
@@ -18,6 +20,7 @@ from custom_components.evse_bus.errors import _COMMAND_KEYS, _PORT_KEYS
 from custom_components.evse_bus.issues import (
     DUPLICATE_ADDRESS,
     LOST,
+    NO_SUCH_PORT,
     NOT_STORED,
     SECOND_MASTER,
     SHARED_ADDRESS,
@@ -33,6 +36,7 @@ HERE = Path(__file__).parents[1] / "custom_components/evse_bus"
 
 DESCRIPTIONS = {
     "binary_sensor": [
+        *binary_sensor.BOX_SENSORS,
         *binary_sensor.CONNECTOR_SENSORS,
         binary_sensor.CONNECTED,
         binary_sensor.ORDERS_EXPIRED,
@@ -40,6 +44,7 @@ DESCRIPTIONS = {
         binary_sensor.SECOND_MASTER,
     ],
     "button": button.BUTTONS,
+    "event": events.EVENTS,
     "number": [
         *number_tables.NUMBERS,
         *number_tables.SETTINGS,
@@ -47,15 +52,21 @@ DESCRIPTIONS = {
     ],
     "select": [selects.MODE, selects.MODE_AT_START],
     "sensor": [
-        *sensor_tables.BUS_SENSORS,
+        *sensor_counts.BUS_SENSORS,
+        *sensor_counts.LISTENER_SENSORS,
+        sensor_counts.CONNECTED_BOXES,
         *sensor_tables.CHARGER_SENSORS,
-        *sensor_tables.CHARGER_STATISTICS,
+        *sensor_counts.CHARGER_STATISTICS,
         *sensor_tables.CONNECTOR_SENSORS,
         sensor_tables.ENERGY,
         sensor_tables.ESTIMATED_ENERGY,
         sensor_tables.FAULT,
     ],
-    "switch": [*switches.COMMANDS, switches.ALLOWED],
+    "switch": [
+        *switches.COMMANDS,
+        *switches.CONNECTOR_COMMANDS,
+        switches.ALLOWED,
+    ],
 }
 
 
@@ -103,6 +114,7 @@ def test_issues_have_texts() -> None:
     assert english()["issues"].keys() == {
         DUPLICATE_ADDRESS,
         LOST,
+        NO_SUCH_PORT,
         NOT_STORED,
         SECOND_MASTER,
         SHARED_ADDRESS,

@@ -21,9 +21,10 @@ from .entity import (
     add_charger_entities,
     supported,
 )
+from .evse.bus import Bus
 from .evse.duty import Duty
 from .evse.model import Capability, Fault
-from .evse.readings import ConnectorReading
+from .evse.readings import ChargerReading, ConnectorReading
 from .sensor_tables import WAITING
 from .unit import ChargerUnit
 
@@ -36,6 +37,19 @@ class ConnectorBinarySensorDescription(BinarySensorEntityDescription):
 
     capability: Capability
     value: Callable[[ConnectorReading], bool | None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoxBinarySensorDescription(BinarySensorEntityDescription):
+    """Something a box says of itself as a whole."""
+
+    capability: Capability
+    value: Callable[[ChargerReading], bool | None]
+    whole: bool = True
+
+
+def _not(value: bool | None) -> bool | None:  # noqa: FBT001 - told, or not
+    return None if value is None else not value
 
 
 CONNECTOR_SENSORS: Final[tuple[ConnectorBinarySensorDescription, ...]] = (
@@ -51,6 +65,62 @@ CONNECTOR_SENSORS: Final[tuple[ConnectorBinarySensorDescription, ...]] = (
         device_class=BinarySensorDeviceClass.BATTERY_CHARGING,
         capability=Capability.CHARGING,
         value=lambda reading: reading.charging,
+    ),
+    ConnectorBinarySensorDescription(
+        key="start_requested",
+        translation_key="start_requested",
+        capability=Capability.START_REQUEST,
+        value=lambda reading: reading.start_requested,
+    ),
+    ConnectorBinarySensorDescription(
+        key="locked",
+        translation_key="locked",
+        # Home Assistant's class is on when something is unlocked.
+        device_class=BinarySensorDeviceClass.LOCK,
+        entity_category=EntityCategory.DIAGNOSTIC,
+        capability=Capability.LOCK,
+        value=lambda reading: _not(reading.locked),
+    ),
+    ConnectorBinarySensorDescription(
+        key="contactor",
+        translation_key="contactor",
+        entity_category=EntityCategory.DIAGNOSTIC,
+        capability=Capability.CONTACTOR,
+        value=lambda reading: reading.contactor,
+    ),
+    ConnectorBinarySensorDescription(
+        key="rcd_tripped",
+        translation_key="rcd_tripped",
+        device_class=BinarySensorDeviceClass.PROBLEM,
+        entity_category=EntityCategory.DIAGNOSTIC,
+        capability=Capability.RCD,
+        value=lambda reading: reading.rcd_tripped,
+    ),
+    ConnectorBinarySensorDescription(
+        key="ventilation_requested",
+        translation_key="ventilation_requested",
+        entity_category=EntityCategory.DIAGNOSTIC,
+        capability=Capability.VENTILATION,
+        value=lambda reading: reading.ventilation_requested,
+    ),
+)
+
+BOX_SENSORS: Final[tuple[BoxBinarySensorDescription, ...]] = (
+    BoxBinarySensorDescription(
+        key="server_connected",
+        translation_key="server_connected",
+        device_class=BinarySensorDeviceClass.CONNECTIVITY,
+        entity_category=EntityCategory.DIAGNOSTIC,
+        capability=Capability.SERVER,
+        value=lambda reading: reading.server_connected,
+    ),
+    BoxBinarySensorDescription(
+        key="ventilating",
+        translation_key="ventilating",
+        device_class=BinarySensorDeviceClass.RUNNING,
+        entity_category=EntityCategory.DIAGNOSTIC,
+        capability=Capability.VENTILATION,
+        value=lambda reading: reading.ventilating,
     ),
 )
 
@@ -82,8 +152,9 @@ async def async_setup_entry(
 ) -> None:
     """Set up the binary sensors of a bus and of its chargers."""
     coordinator = entry.runtime_data
-    async_add_entities([ConnectedSensor(coordinator, CONNECTED)])
-    if (duty := coordinator.bus.duty) is not None:
+    if coordinator.bus is not None:
+        async_add_entities([ConnectedSensor(coordinator, coordinator.bus)])
+    if (duty := coordinator.lines.duty) is not None:
         async_add_entities([SecondMasterSensor(coordinator, duty)])
     add_charger_entities(
         Platform.BINARY_SENSOR, entry, async_add_entities, _sensors, _unwanted
@@ -95,10 +166,14 @@ def _sensors(
 ) -> Iterable[BinarySensorEntity]:
     charger = unit.charger
     yield ProblemSensor(coordinator, unit, PROBLEM)
+    if unit.leads and coordinator.bus is None:
+        yield BoxConnectedSensor(coordinator, unit)
+    for box_description in supported(unit, BOX_SENSORS):
+        yield BoxBinarySensor(coordinator, unit, box_description)
     if charger.config.order_lifetime is not None:
         yield OrdersExpiredSensor(coordinator, unit, ORDERS_EXPIRED)
     for number in sorted(unit.numbers):
-        for description in supported(charger, CONNECTOR_SENSORS):
+        for description in supported(unit, CONNECTOR_SENSORS):
             yield ConnectorBinarySensor(coordinator, unit, number, description)
 
 
@@ -110,10 +185,55 @@ def _unwanted(unit: ChargerUnit) -> Iterable[str]:
 class ConnectedSensor(BusEntity, BinarySensorEntity):
     """Whether the port is open."""
 
+    def __init__(self, coordinator: BusCoordinator, bus: Bus) -> None:
+        """Belong to the bus."""
+        super().__init__(coordinator, CONNECTED)
+        self._bus = bus
+
     @override
     def show(self) -> Hashable:
         """Show whether bytes can go out."""
-        self._attr_is_on = self.coordinator.bus.connected
+        self._attr_is_on = self._bus.connected
+        return self._attr_is_on
+
+
+class BoxConnectedSensor(ChargerEntity, BinarySensorEntity):
+    """Whether a box that dials us is connected."""
+
+    def __init__(self, coordinator: BusCoordinator, unit: ChargerUnit) -> None:
+        """Belong to the box."""
+        super().__init__(coordinator, unit, CONNECTED, whole=True)
+
+    @override
+    def is_available(self) -> bool:
+        """Return true: a box that is gone is just what this tells."""
+        return True
+
+    @override
+    def show(self) -> Hashable:
+        """Show whether it is connected."""
+        self._attr_is_on = self.unit.bus.connected
+        return self._attr_is_on
+
+
+class BoxBinarySensor(ChargerEntity, BinarySensorEntity):
+    """Something a box says of itself as a whole."""
+
+    def __init__(
+        self,
+        coordinator: BusCoordinator,
+        unit: ChargerUnit,
+        description: BoxBinarySensorDescription,
+    ) -> None:
+        """Belong to the box."""
+        super().__init__(coordinator, unit, description, whole=description.whole)
+        self._value = description.value
+
+    @override
+    def show(self) -> Hashable:
+        """Show what the box said."""
+        reading = self.charger.reading
+        self._attr_is_on = None if reading is None else self._value(reading)
         return self._attr_is_on
 
 

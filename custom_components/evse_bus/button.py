@@ -25,6 +25,8 @@ class CommandButtonDescription(ButtonEntityDescription):
 
     capability: Capability
     command: Command
+    whole: bool = False
+    """Of the whole box, where that has several ports."""
 
 
 BUTTONS: Final[tuple[CommandButtonDescription, ...]] = (
@@ -35,12 +37,25 @@ BUTTONS: Final[tuple[CommandButtonDescription, ...]] = (
         entity_category=EntityCategory.CONFIG,
         capability=Capability.RESET,
         command=Command.RESET,
+        whole=True,
     ),
     CommandButtonDescription(
         key="wake",
         translation_key="wake",
         capability=Capability.WAKE,
         command=Command.WAKE,
+    ),
+    CommandButtonDescription(
+        key="stop_and_unlock",
+        translation_key="stop_and_unlock",
+        capability=Capability.START_REQUEST,
+        command=Command.STOP_AND_UNLOCK,
+    ),
+    CommandButtonDescription(
+        key="request_start",
+        translation_key="request_start",
+        capability=Capability.START_REQUEST,
+        command=Command.REQUEST_START,
     ),
 )
 
@@ -55,7 +70,7 @@ async def async_setup_entry(
 
 
 def _buttons(coordinator: BusCoordinator, unit: ChargerUnit) -> Iterable[ButtonEntity]:
-    for description in supported(unit.charger, BUTTONS):
+    for description in supported(unit, BUTTONS):
         yield CommandButton(coordinator, unit, description)
 
 
@@ -69,7 +84,7 @@ class CommandButton(ChargerEntity, ButtonEntity):
         description: CommandButtonDescription,
     ) -> None:
         """Belong to the charger."""
-        super().__init__(coordinator, unit, description)
+        super().__init__(coordinator, unit, description, whole=description.whole)
         self._command = description.command
 
     @override

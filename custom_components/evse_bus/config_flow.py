@@ -6,11 +6,10 @@ from typing import Any, Final, override
 from homeassistant.config_entries import (
     ConfigEntry,
     ConfigEntryState,
-    ConfigFlow,
-    ConfigFlowContext,
     ConfigFlowResult,
     ConfigSubentryData,
     ConfigSubentryFlow,
+    OptionsFlow,
 )
 from homeassistant.const import CONF_DEVICE
 from homeassistant.core import callback
@@ -32,6 +31,7 @@ from .evse.protocol import Progress, Protocol
 from .evse.protocols import PROTOCOLS
 from .flow_address import ADDRESSES, Errors, typed_addresses
 from .flow_charger import CONF_EXPERT, short_name
+from .flow_listener import ListenerOptionsFlow, ListenerSteps
 from .flow_scan import (
     Imposed,
     async_search,
@@ -42,7 +42,6 @@ from .flow_scan import (
     port_name,
 )
 from .flow_schema import (
-    MAKES,
     SUGGESTED_LIMIT,
     bus_data,
     check_impose,
@@ -51,7 +50,6 @@ from .flow_schema import (
     port_suggestions,
     protocol_form,
 )
-from .flow_steps import ChargerSteps
 from .flow_supply import check_supply, supply_data, supply_form
 from .setup import line_settings, protocol_of
 from .subentry_flow import ChargerSubentryFlow
@@ -60,9 +58,7 @@ _URL_EXAMPLES: Final = "`socket://192.0.2.5:4001`, `rfc2217://192.0.2.5:2217`"
 """Not for translators: what is typed is the same everywhere."""
 
 
-class EvseBusConfigFlow(
-    ChargerSteps[ConfigFlowContext, ConfigFlowResult, str], ConfigFlow, domain=DOMAIN
-):
+class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
     """Set up one bus."""
 
     VERSION = 1
@@ -85,6 +81,20 @@ class EvseBusConfigFlow(
         """Return what can be added to a bus."""
         return {SUBENTRY_CHARGER: ChargerSubentryFlow}
 
+    @classmethod
+    @callback
+    @override
+    def async_supports_options_flow(cls, config_entry: ConfigEntry) -> bool:
+        """Return whether it listens: only then there is something to restrict."""
+        return protocol_of(config_entry.data).dials_in
+
+    @staticmethod
+    @callback
+    @override
+    def async_get_options_flow(config_entry: ConfigEntry) -> OptionsFlow:
+        """Return the dialogue about who may dial."""
+        return ListenerOptionsFlow()
+
     # -- Protocol and port -------------------------------------------------------
 
     @override
@@ -93,10 +103,12 @@ class EvseBusConfigFlow(
     ) -> ConfigFlowResult:
         """Choose what chargers they are."""
         if user_input is not None:
-            protocols = MAKES[user_input[CONF_PROTOCOL]]
-            if len(protocols) > 1:
+            make = user_input[CONF_PROTOCOL]
+            if make == "smartevse":
                 return await self.async_step_mode()
-            self.protocol = PROTOCOLS[protocols[0]]
+            if make == "ews":
+                return await self.async_step_connection()
+            self.protocol = PROTOCOLS[make]
             return await self.async_step_port()
         return self.async_show_form(step_id="user", data_schema=protocol_form())
 
@@ -121,6 +133,23 @@ class EvseBusConfigFlow(
     ) -> ConfigFlowResult:
         """Be the load-balancing master of several boxes."""
         self.protocol = PROTOCOLS["smartevse_master"]
+        return await self.async_step_port()
+
+    async def async_step_connection(
+        self,
+        user_input: dict[str, Any] | None = None,  # noqa: ARG002
+    ) -> ConfigFlowResult:
+        """Choose how an EWS-Box is connected."""
+        return self.async_show_menu(
+            step_id="connection", menu_options=["ews_serial", "ews_network"]
+        )
+
+    async def async_step_ews_serial(
+        self,
+        user_input: dict[str, Any] | None = None,  # noqa: ARG002
+    ) -> ConfigFlowResult:
+        """Speak to one box over RS-232."""
+        self.protocol = PROTOCOLS["ews"]
         return await self.async_step_port()
 
     async def async_step_port(
@@ -165,7 +194,9 @@ class EvseBusConfigFlow(
         if not device:
             return {CONF_DEVICE: "no_port"}
         for other in self._async_current_entries(include_ignore=False):
-            if not await self.hass.async_add_executor_job(
+            if protocol_of(
+                other.data
+            ).dials_in or not await self.hass.async_add_executor_job(
                 is_same_port, device, other.data[CONF_DEVICE]
             ):
                 continue
@@ -286,6 +317,8 @@ class EvseBusConfigFlow(
     @override
     def finish(self, chargers: list[ConfigSubentryData]) -> ConfigFlowResult:
         """Create the bus with its chargers."""
+        if self._listener is not None:
+            return self.add_box(chargers)
         # Another dialogue may have been quicker.
         self._async_abort_entries_match({CONF_DEVICE: self.bus_data[CONF_DEVICE]})
         return self.async_create_entry(
@@ -300,6 +333,8 @@ class EvseBusConfigFlow(
         """Change the port or its settings."""
         entry = self._get_reconfigure_entry()
         protocol = protocol_of(entry.data)
+        if protocol.dials_in:
+            return await self.async_step_reconfigure_listen()
         errors: Errors = {}
         if user_input is not None:
             errors = check_supply(user_input)

@@ -21,15 +21,26 @@ CONF_SUPPLY_LIMIT: Final = "supply_limit"
 CONF_SUPPLY_MINIMUM: Final = "supply_minimum"
 """Least current that a charger of such a bus charges with, A."""
 
+CONF_ALLOWED: Final = "allowed"
+"""Option of a listener: networks whose boxes may dial in; empty: all may.
+
+Where it listens stands under homeassistant.const.CONF_HOST and CONF_PORT.
+"""
+
 # -- A config subentry is one charger --------------------------------------------
-# Its address stands under homeassistant.const.CONF_ADDRESS.
+# Its address stands under homeassistant.const.CONF_ADDRESS; of a box that is alone on
+# its bus it is the serial number, as far as known.
 
 SUBENTRY_CHARGER: Final = "charger"
 
 CONF_SERIAL: Final = "serial"
 """Serial number as text, or None: then the first one found there is kept."""
 CONF_INSTALLATION_LIMIT: Final = "installation_limit"
-"""A"""
+"""A; where a box has several ports, of the first."""
+CONF_PORTS: Final = "ports"
+"""How many ports of a box are used (EWS-Box)."""
+CONF_INSTALLATION_LIMIT_2: Final = "installation_limit_2"
+"""Of a box's second port, A."""
 CONF_VOLTAGE: Final = "voltage"
 """Phase to neutral, V."""
 CONF_POLL_INTERVAL: Final = "poll_interval"

@@ -12,25 +12,28 @@ from functools import partial
 from typing import Any, Final, override
 
 from homeassistant.config_entries import ConfigEntry, ConfigSubentry
-from homeassistant.const import CONF_DEVICE
 from homeassistant.core import CALLBACK_TYPE, Event, HomeAssistant, callback
 from homeassistant.helpers.event import async_track_time_interval
 from homeassistant.helpers.update_coordinator import BaseDataUpdateCoordinatorProtocol
+from homeassistant.util import dt as dt_util
 
 from .const import CONF_SERIAL, LOGGER, SUBENTRY_CHARGER
 from .devices import BusDevices, connector_key
+from .discovery import async_set_up_now, async_wants_to_connect
+from .evse.bus import Bus
+from .evse.ews import EwsPort
 from .evse.listeners import tell
-from .evse.model import Orders, Supply
+from .evse.model import ChargerConfig, Orders, Supply
 from .farewell import async_say_farewell
 from .finish import async_finish
 from .issues import BusIssues
+from .lines import lines_of
 from .orders import OrderStore
 from .setup import (
     changes_in_place,
-    charger_config,
+    charger_configs,
     charger_unique_id,
     first_orders,
-    line_settings,
     made_of,
     protocol_of,
     supply_of,
@@ -55,17 +58,11 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         """Prepare the bus; nothing is opened or read yet."""
         self.hass = hass
         self.entry = entry
-        self.port: str = entry.data[CONF_DEVICE]
         self.data = made_of(entry.data)
         """What the bus was made of: when that changes, it is made anew."""
         self.protocol = protocol_of(entry.data)
+        self.lines = lines_of(entry, partial(async_wants_to_connect, hass, entry))
         installed = supply_of(entry.data)
-        self.bus = self.protocol.bus(
-            self.port,
-            settings=line_settings(entry.data),
-            name=entry.title,
-            supply=installed,
-        )
         self.units: dict[str, ChargerUnit] = {}
         self.issues = BusIssues(hass, entry)
         self.devices = BusDevices(hass, entry, self.protocol.name)
@@ -83,6 +80,16 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         self._changing = asyncio.Lock()
         self._stopped = False
 
+    @property
+    def bus(self) -> Bus | None:
+        """Return the bus of all chargers; ``None``: each box has its own."""
+        return self.lines.only
+
+    @property
+    def port(self) -> str:
+        """Return the name of the port or address, for messages."""
+        return self.lines.name
+
     # -- Life --------------------------------------------------------------------
 
     async def async_start(self) -> None:
@@ -90,17 +97,18 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         await self.orders.async_load()
         await self._async_begin_sharing()
         await self.async_match_subentries()
-        self._unsubscribe.append(self.bus.subscribe(partial(self._notify, BUS)))
-        await self.bus.start()
+        if self.bus is not None:
+            self._unsubscribe.append(self.bus.subscribe(partial(self._notify, BUS)))
+        await self.lines.start()
 
     async def _async_begin_sharing(self) -> None:
-        if self.supply is None or self.bus.duty is None:
+        if self.supply is None or self.lines.duty is None:
             return
         # Its device outlives restarts: there is one, so there was an order.
         new = not self.devices.has(self.entry.entry_id)
         if not await self.supply.async_begin(new=new):
             self.issues.supply_lost(self.supply.limit)
-        self._unsubscribe.append(self.bus.duty.subscribe(self._on_duty))
+        self._unsubscribe.append(self.lines.duty.subscribe(self._on_duty))
 
     async def async_shutdown(self, _event: Event) -> None:
         """Stop with Home Assistant: chargers that are to be told so are told."""
@@ -113,7 +121,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
             self._stopped = True
             while self._unsubscribe:
                 self._unsubscribe.pop()()
-            await self.bus.stop()
+            await self.lines.stop()
             for unit in self.units.values():
                 unit.unsubscribe()
                 unit.unsubscribe = lambda: None
@@ -138,13 +146,13 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
 
     async def _async_share(self, supply: Supply) -> None:
         self._notify(BUS)
-        if self.bus.duty is not None:
-            await self.bus.duty.change_supply(supply)
+        if self.lines.duty is not None:
+            await self.lines.duty.change_supply(supply)
 
     @callback
     def _on_duty(self) -> None:
-        if self.bus.duty is not None:
-            self.issues.check_bus(self.bus.duty.noticed)
+        if self.lines.duty is not None:
+            self.issues.check_bus(self.lines.duty.noticed)
         self._notify(BUS)
 
     # -- Chargers come, change and go --------------------------------------------
@@ -157,53 +165,69 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         async with self._changing:
             if self._stopped:
                 return
-            self.bus.name = self.entry.title
+            self.lines.rename(self.entry.title)
+            self.lines.follow_options(self.entry.options)
             self.devices.show_bus()
+            zone = dt_util.get_default_time_zone()
             wanted = {
-                subentry.subentry_id: subentry
+                config.key: (subentry, config)
                 for subentry in self.entry.get_subentries_of_type(SUBENTRY_CHARGER)
+                for config in charger_configs(self.entry.data, subentry, zone)
             }
             for key in self.units.keys() - wanted.keys():
                 await self._remove(self.units[key])
-            for key, subentry in wanted.items():
+            for key, (subentry, config) in wanted.items():
                 if (unit := self.units.get(key)) is None:
-                    await self._add(subentry)
+                    await self._add(subentry, config)
                 else:
-                    await self._change(unit, subentry)
+                    await self._change(unit, subentry, config)
             await self.orders.async_keep_only(wanted)
 
-    async def _add(self, subentry: ConfigSubentry) -> None:
-        key = subentry.subentry_id
-        orders = self.orders.get(key)
+    async def _add(self, subentry: ConfigSubentry, config: ChargerConfig) -> None:
+        key = config.key
+        charger_orders = self.orders.get(key)
         # Its device outlives restarts: there is one, so there were orders.
-        lost = orders is None and self.devices.has(key)
-        if orders is None:
-            orders = first_orders(subentry)
+        lost = charger_orders is None and self.devices.has(key, subentry.subentry_id)
+        orders = charger_orders or first_orders(subentry, config)
+        if charger_orders is None:
             await self.orders.async_commit(key, orders)
-        charger = self.protocol.charger(
-            charger_config(self.entry.data, subentry), orders
-        )
-        unit = ChargerUnit(subentry, charger)
+        charger = self.protocol.charger(config, orders)
+        part = config.address if self.protocol.ports > 1 else None
+        unit = ChargerUnit(subentry, charger, await self.lines.join(config), part)
         self.units[key] = unit
         self.devices.show_charger(unit)
         if lost:
             self.issues.orders_lost(unit, orders)
         self._connect(unit)
         self._add_entities(unit)
+        async_set_up_now(self.hass, subentry)
 
     def _connect(self, unit: ChargerUnit) -> None:
         charger = unit.charger
         charger.commit = partial(self._async_commit, unit)
-        unit.unsubscribe = charger.subscribe(partial(self._on_charger, unit))
-        self.bus.add(charger)
+        stop = [charger.subscribe(partial(self._on_charger, unit))]
+        if self.bus is None:
+            # Its own line comes and goes.
+            tell_line = partial(self._notify, (unit.key, None))
+            stop.append(unit.bus.subscribe(tell_line))
+
+        def unsubscribe() -> None:
+            while stop:
+                stop.pop()()
+
+        unit.unsubscribe = unsubscribe
+        unit.bus.add(charger)
+        if isinstance(charger, EwsPort):
+            stop.append(charger.subscribe_events(unit.events.tell))
 
     async def _async_commit(self, unit: ChargerUnit, orders: Orders) -> None:
         self.issues.orders_renewed(unit)
-        await self.orders.async_commit(unit.subentry_id, orders)
+        await self.orders.async_commit(unit.key, orders)
 
-    async def _change(self, unit: ChargerUnit, subentry: ConfigSubentry) -> None:
+    async def _change(
+        self, unit: ChargerUnit, subentry: ConfigSubentry, config: ChargerConfig
+    ) -> None:
         unit.subentry = subentry
-        config = charger_config(self.entry.data, subentry)
         old = unit.charger
         if config == old.config:
             return
@@ -214,9 +238,11 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
             self._on_charger(unit)
             return
         unit.unsubscribe()
-        await self.bus.remove(old)
+        await unit.bus.remove(old)
+        await self.lines.leave(unit.bus)
         self.issues.forget(unit)
         unit.charger = self.protocol.charger(config, old.orders)
+        unit.bus = await self.lines.join(config)
         self.devices.show_charger(unit)
         self._connect(unit)
         self._on_charger(unit)
@@ -224,8 +250,10 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
     async def _remove(self, unit: ChargerUnit) -> None:
         unit.unsubscribe()
         await async_say_farewell([unit.charger], for_good=True)
-        await self.bus.remove(unit.charger)
-        del self.units[unit.subentry_id]
+        await unit.bus.remove(unit.charger)
+        await self.lines.leave(unit.bus)
+        del self.units[unit.key]
+        self.devices.forget_port(unit)
         self.issues.forget(unit)
 
     # -- What a charger tells ----------------------------------------------------
@@ -242,10 +270,10 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         )
         self._learn(unit)
         self.issues.check(unit)
-        self._notify((unit.subentry_id, None))
+        self._notify((unit.key, None))
         for number in before.keys() | unit.connectors.keys():
             if before.get(number) != unit.connectors.get(number):
-                self._notify((unit.subentry_id, number))
+                self._notify((unit.key, number))
 
     def _learn(self, unit: ChargerUnit) -> None:
         """Show what was not known of a charger before."""
@@ -288,7 +316,9 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
     def forget_connector(self, keys: set[str]) -> bool:
         """Forget a connector by its device's identifiers, if it is gone."""
         for unit in self.units.values():
-            for number in tuple(unit.numbers):
+            # The ports of a box are what the set-up says, also while it is off.
+            numbers = () if unit.part is not None else tuple(unit.numbers)
+            for number in numbers:
                 key = connector_key(unit, number)
                 if key in keys and number not in unit.connectors:
                     unit.numbers.discard(number)
@@ -306,6 +336,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
                 for unit in self.units.values()
                 for key in (
                     unit.subentry_id,
+                    unit.key,
                     *(connector_key(unit, number) for number in unit.numbers),
                 )
             )

@@ -1,38 +1,68 @@
 """Diagnostics: all that helps to find a fault, without what identifies a house."""
 
-from collections.abc import Mapping, Set as AbstractSet
+from collections.abc import Mapping, Sequence, Set as AbstractSet
 from dataclasses import fields, is_dataclass
 from datetime import UTC, datetime
 from math import isfinite
 from typing import Any, Final
 
 from homeassistant.components.diagnostics import REDACTED, async_redact_data
-from homeassistant.const import CONF_ADDRESS, CONF_DEVICE
+from homeassistant.const import CONF_ADDRESS, CONF_DEVICE, CONF_HOST
 from homeassistant.core import HomeAssistant
 from homeassistant.helpers.device_registry import ChildDeviceEntry, DeviceEntry
 
 from .const import CONF_SERIAL, DOMAIN
 from .coordinator import BusCoordinator, EvseBusConfigEntry
+from .evse.bus import Bus
 from .evse.smartevse import Master
 from .evse.statistics import Direction
+from .lines import ListenerLines
 from .redaction import on_wire, without_serial
 from .unit import ChargerUnit
 
 # An adapter's path and a network address name the house as a serial number does.
 # An EVBox is addressed by its serial number.
-_PRIVATE: Final = {CONF_DEVICE, CONF_SERIAL, "serials", "information"}
+_PRIVATE: Final = {
+    CONF_DEVICE,
+    CONF_HOST,
+    CONF_SERIAL,
+    "information",
+    "serials",
+    "user",
+}
 _PRIVATE_ADDRESS: Final = {"evbox"}
 
 
 async def async_get_config_entry_diagnostics(
-    hass: HomeAssistant,
+    hass: HomeAssistant,  # noqa: ARG001 - Home Assistant's signature
     entry: EvseBusConfigEntry,
 ) -> dict[str, Any]:
     """Return a bus, its last frames and its chargers."""
     coordinator = entry.runtime_data
-    bus = coordinator.bus
-    return {
+    units = coordinator.units.values()
+    data = {
         "set_up": async_redact_data(dict(entry.data), _PRIVATE),
+        "master": _master(coordinator),
+        "chargers": [_charger(coordinator, unit) for unit in units],
+    }
+    if isinstance(lines := coordinator.lines, ListenerLines):
+        return data | {
+            "listener": {
+                "networks_allowed": len(lines.listener.allowed),
+                **plain(lines.listener.statistics),
+            },
+            "boxes": [
+                _bus(coordinator, unit.bus, [unit]) for unit in units if unit.leads
+            ],
+        }
+    return data | _bus(coordinator, lines.only, list(units)) if lines.only else data
+
+
+def _bus(
+    coordinator: BusCoordinator, bus: Bus, units: Sequence[ChargerUnit]
+) -> dict[str, Any]:
+    """Return a line, the bus on it, and its last frames."""
+    return {
         "line": {
             "settings": str(bus.line.settings),
             "echoes": bus.line.echoes,
@@ -40,14 +70,10 @@ async def async_get_config_entry_diagnostics(
         },
         "bus": {
             "connected": bus.connected,
-            "utilisation": bus.wire.statistics.utilisation(hass.loop.time()),
+            "utilisation": bus.wire.statistics.utilisation(bus.now),
             **plain(bus.wire.statistics),
         },
-        "master": _master(coordinator),
-        "chargers": [
-            _charger(coordinator, unit) for unit in coordinator.units.values()
-        ],
-        "frames": _frames(coordinator),
+        "frames": _frames(coordinator, bus, units),
     }
 
 
@@ -59,18 +85,24 @@ async def async_get_device_diagnostics(
     """Return one charger and the bus's last frames; for the bus: all."""
     coordinator = entry.runtime_data
     keys = {key for domain, key in device.identifiers if domain == DOMAIN}
-    for unit in coordinator.units.values():
-        if unit.subentry_id == device.config_subentry_id or unit.subentry_id in keys:
-            return {
-                "charger": _charger(coordinator, unit),
-                "frames": _frames(coordinator),
-            }
-    return await async_get_config_entry_diagnostics(hass, entry)
+    units = tuple(coordinator.units.values())
+    mine = [unit for unit in units if unit.key in keys] or [
+        unit
+        for unit in units
+        if unit.subentry_id == device.config_subentry_id or unit.subentry_id in keys
+    ]
+    if not mine:
+        return await async_get_config_entry_diagnostics(hass, entry)
+    told = [_charger(coordinator, unit) for unit in mine]
+    return {
+        **({"charger": told[0]} if len(told) == 1 else {"chargers": told}),
+        "frames": _frames(coordinator, mine[0].bus, units),
+    }
 
 
 def _master(coordinator: BusCoordinator) -> dict[str, Any] | None:
     """Return what the master of a bus does; ``None``: the bus has none."""
-    duty = coordinator.bus.duty
+    duty = coordinator.lines.duty
     if duty is None:
         return None
     order = coordinator.orders.supply
@@ -112,9 +144,11 @@ def _charger(coordinator: BusCoordinator, unit: ChargerUnit) -> dict[str, Any]:
     return async_redact_data(data, _PRIVATE)
 
 
-def _frames(coordinator: BusCoordinator) -> list[dict[str, str]]:
+def _frames(
+    coordinator: BusCoordinator, bus: Bus, units: Sequence[ChargerUnit]
+) -> list[dict[str, str]]:
     protocol = coordinator.protocol.key
-    chargers = [unit.charger for unit in coordinator.units.values()]
+    chargers = [unit.charger for unit in units]
     told = {one.config.serial for one in chargers}
     told |= {one.info.serial for one in chargers if one.info is not None}
     serials = on_wire(protocol, told)
@@ -129,7 +163,7 @@ def _frames(coordinator: BusCoordinator) -> list[dict[str, str]]:
                 whole=frame.direction is not Direction.UNREADABLE,
             ).hex(),
         }
-        for frame in coordinator.bus.wire.frames
+        for frame in bus.wire.frames
     ]
 
 

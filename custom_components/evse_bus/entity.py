@@ -45,14 +45,18 @@ class CapabilityDescription(Protocol):
 
 
 def supported[D: CapabilityDescription](
-    charger: Charger, descriptions: Iterable[D]
+    unit: ChargerUnit, descriptions: Iterable[D]
 ) -> Iterable[D]:
-    """Return what a charger has of a table."""
-    capabilities = charger.capabilities
+    """Return what a charger has of a table.
+
+    What is of a whole box (``whole``) is there once, however many ports it has.
+    """
+    capabilities = unit.charger.capabilities
     return (
         description
         for description in descriptions
-        if description.capability is None or description.capability in capabilities
+        if (description.capability is None or description.capability in capabilities)
+        and (unit.leads or not getattr(description, "whole", False))
     )
 
 
@@ -78,7 +82,7 @@ def add_charger_entities(
             # The bus still talks while the platforms are being unloaded.
             return
         for key in unwanted(unit):
-            unique_id = f"{unit.subentry_id}_{key}"
+            unique_id = f"{unit.key}_{key}"
             unit.added.discard((domain, unique_id))
             if known := registry.async_get_entity_id(domain, DOMAIN, unique_id):
                 registry.async_remove(known)
@@ -177,12 +181,19 @@ class ChargerEntity(EvseBusEntity):
         unit: ChargerUnit,
         description: EntityDescription,
         context: Context | None = None,
+        *,
+        whole: bool = False,
     ) -> None:
-        """Belong to the charger's device."""
-        super().__init__(coordinator, context or (unit.subentry_id, None), description)
+        """Belong to the charger's device; ``whole``: to that of its whole box."""
+        super().__init__(coordinator, context or (unit.key, None), description)
         self.unit = unit
-        self._attr_unique_id = f"{unit.subentry_id}_{description.key}"
-        self._attr_device_info = charger_info(unit)
+        owner = unit.subentry_id if whole else unit.key
+        self._attr_unique_id = f"{owner}_{description.key}"
+        self._attr_device_info = (
+            connector_info(unit, unit.part)
+            if unit.part is not None and unit.split and not whole
+            else charger_info(unit)
+        )
 
     @property
     def charger(self) -> Charger:
@@ -237,9 +248,7 @@ class ConnectorEntity(ChargerEntity):
         description: EntityDescription,
     ) -> None:
         """Belong to the connector's device, or to its charger's if it is the only."""
-        super().__init__(
-            coordinator, unit, description, context=(unit.subentry_id, number)
-        )
+        super().__init__(coordinator, unit, description, context=(unit.key, number))
         self.number = number
         self._attr_unique_id = f"{connector_key(unit, number)}_{description.key}"
         if unit.split:

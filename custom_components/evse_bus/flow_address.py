@@ -14,6 +14,8 @@ from homeassistant.helpers.selector import (
 )
 import probatio as vol
 
+from .evse.found import Address
+
 if TYPE_CHECKING:
     from .evse.protocol import Protocol
 
@@ -31,10 +33,14 @@ class AddressForm:
     """Key of the field for several."""
     error: str
     """Said of anything that is no such address."""
-    lowest: int
-    highest: int
-    any: int | None = None
+    lowest: int = 0
+    highest: int = 0
+    text: bool = False
+    """It is no number but a text, of `digits` letters and digits at most."""
+    any: Address | None = None
     """Address that every box answers to, for a box that is alone on its line."""
+    optional: bool = False
+    """It may be left out: then the first box that is found is kept."""
     is_serial: bool = False
     """The address is the serial number."""
     tells_serial: bool = True
@@ -45,20 +51,26 @@ class AddressForm:
     """Key of the texts for the addresses to choose from, under ``selector``."""
     digits: int = 1
 
-    def parse(self, text: object) -> int:
+    def parse(self, text: object) -> Address:
         """Return a typed address; raises ValueError when it is none."""
         typed = str(text).strip()
+        if self.text:
+            if not (typed.isalnum() and typed.isascii() and len(typed) <= self.digits):
+                raise ValueError(typed)
+            return typed
         if not typed.isdecimal() or not typed.isascii():
             raise ValueError(typed)
         if not self.lowest <= (address := int(typed)) <= self.highest:
             raise ValueError(typed)
         return address
 
-    def show(self, address: int) -> str:
+    def show(self, address: Address) -> str:
         """Return an address as people read it on the box."""
+        if isinstance(address, str):
+            return address
         return f"{address:0{self.digits}d}"
 
-    def serial(self, address: int) -> str | None:
+    def serial(self, address: Address) -> str | None:
         """Return the serial number that an address tells, as the library has it."""
         if not self.is_serial or address == self.any:
             return None
@@ -126,31 +138,62 @@ ADDRESSES: Final[Mapping[str, AddressForm]] = {
         tells_serial=False,
         labels="slave",
     ),
+    "ews": AddressForm(
+        one="box_serial",
+        many="box_serials",
+        error="bad_box_serial",
+        # The number of a port, where one is needed for a search.
+        lowest=1,
+        text=True,
+        digits=12,
+        any="",
+        optional=True,
+        is_serial=True,
+        alone=True,
+    ),
+    "ews_network": AddressForm(
+        one="box_serial",
+        many="box_serials",
+        error="bad_box_serial",
+        text=True,
+        digits=12,
+        is_serial=True,
+    ),
 }
 
 
-def manual_form(protocol: Protocol, *, multiple: bool) -> vol.Schema:
-    """Ask where the chargers are."""
+def manual_form(
+    protocol: Protocol, *, multiple: bool, known: Iterable[str] = ()
+) -> vol.Schema:
+    """Ask where the chargers are; ``known``: those that wait to be added."""
     address = ADDRESSES[protocol.key]
+    if options := list(known):
+        chosen = SelectSelector(
+            SelectSelectorConfig(
+                options=options, custom_value=True, mode=SelectSelectorMode.DROPDOWN
+            )
+        )
+        return vol.Schema({vol.Required(address.one): chosen})
     if multiple:
         return vol.Schema({vol.Required(address.many): address.selector_many})
     return vol.Schema({vol.Required(address.one): address.selector})
 
 
 def typed_addresses(
-    protocol: Protocol, typed: Mapping[str, Any], taken: Iterable[int] = ()
-) -> tuple[list[int], Errors]:
+    protocol: Protocol, typed: Mapping[str, Any], taken: Iterable[Address] = ()
+) -> tuple[list[Address], Errors]:
     """Return the addresses typed into a form, and what is wrong with them."""
     form = ADDRESSES[protocol.key]
     key = form.many if form.many in typed else form.one
-    texts = typed[key] if form.many in typed else [typed[key]]
+    texts = typed[key] if form.many in typed else [typed.get(key, "")]
     try:
         addresses = [form.parse(text) for text in texts if str(text).strip()]
     except ValueError:
         return [], {key: form.error}
     taken = set(taken)
     if not addresses:
-        return [], {key: "no_address"}
+        left_out = form.optional and form.any is not None
+        return ([form.any], {}) if left_out else ([], {key: "no_address"})
     if len(set(addresses)) < len(addresses):
         return [], {key: "address_twice"}
     if taken.intersection(addresses):

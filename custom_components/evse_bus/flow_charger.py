@@ -15,13 +15,16 @@ from .const import (
     CONF_FAIL_SAFE_TIMEOUT,
     CONF_INFORMATION,
     CONF_INSTALLATION_LIMIT,
+    CONF_INSTALLATION_LIMIT_2,
     CONF_ORDER_LIFETIME,
     CONF_PHASE_ORDER,
     CONF_POLL_INTERVAL,
+    CONF_PORTS,
     CONF_SERIAL,
     CONF_STOP_ON_SHUTDOWN,
     CONF_VOLTAGE,
 )
+from .evse.found import Address
 from .evse.model import MINIMUM_CURRENT
 from .evse.safety import MAXIMUM_TIMEOUT
 from .flow_address import ADDRESSES, Errors
@@ -39,6 +42,7 @@ from .flow_schema import (
     quantity,
     suggest,
 )
+from .setup import PORT_LIMITS
 
 if TYPE_CHECKING:
     from homeassistant.config_entries import ConfigSubentry, ConfigSubentryData
@@ -58,11 +62,18 @@ NO: Final = "-"
 """In tables, where a word would have to be translated."""
 
 
+_PRODUCTS: Final = {"ews": "EWS-Box", "ews_network": "EWS-Box"}
+_NAME_DIGITS: Final = 8
+"""So much of an address is enough to tell chargers apart."""
+_TELL_POWER: Final = frozenset(_PRODUCTS)
+"""Protocols whose chargers need no voltage to estimate power from."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Candidate:
     """A charger on its way into the configuration."""
 
-    address: int
+    address: Address
     found: FoundCharger | None = None
     """What it told, if it has been asked and has answered."""
 
@@ -83,18 +94,25 @@ class Candidate:
             "maximum": f"{maximum:g} A" if maximum is not None else "?",
         }
 
+    def suggestions(self) -> dict[str, Any]:
+        """Return what it told that the form is to begin with."""
+        told = self.found
+        if told is None or not told.maximum_currents:
+            return {}
+        return {CONF_PORTS: str(told.connectors)}
+
 
 def short_name(protocol: Protocol) -> str:
-    """Return the maker's name."""
-    return protocol.name.split()[0]
+    """Return what people call these chargers: the maker's name, or the product's."""
+    return _PRODUCTS.get(protocol.key) or protocol.name.split()[0]
 
 
-def default_name(protocol: Protocol, address: int) -> str:
+def default_name(protocol: Protocol, address: Address) -> str:
     """Return the name offered for a charger."""
     form = ADDRESSES[protocol.key]
     if form.alone:
         return short_name(protocol)
-    return f"{short_name(protocol)} {form.show(address)}"
+    return f"{short_name(protocol)} {form.show(address)[-_NAME_DIGITS:]}"
 
 
 # -- The form --------------------------------------------------------------------
@@ -111,10 +129,19 @@ def charger_form(
     address = ADDRESSES[protocol.key]
     form: dict[vol.Marker, object] = {vol.Required(CONF_NAME): TextSelector()}
     if ask_address:
-        form[vol.Required(address.one)] = address.selector
+        marker = vol.Optional if address.optional else vol.Required
+        form[marker(address.one)] = address.selector
         if address.tells_serial and not address.is_serial:
             form[vol.Optional(CONF_SERIAL)] = TextSelector()
+    if protocol.ports > 1:
+        counts = tuple(str(count) for count in range(1, protocol.ports + 1))
+        form[vol.Required(CONF_PORTS, default=counts[-1])] = dropdown(
+            CONF_PORTS, counts
+        )
     form[suggest(CONF_INSTALLATION_LIMIT, SUGGESTED_LIMIT)] = amperes(MINIMUM_CURRENT)
+    if protocol.ports > 1:
+        second = suggest(CONF_INSTALLATION_LIMIT_2, SUGGESTED_LIMIT, optional=True)
+        form[second] = amperes(MINIMUM_CURRENT)
     if new:
         form[vol.Required(CONF_FAIL_SAFE_CURRENT, default=MINIMUM_CURRENT)] = amperes()
         if protocol.probe_imposes:
@@ -148,10 +175,11 @@ def _expert_form(protocol: Protocol) -> vol.Schema:
         vol.Required(
             CONF_POLL_INTERVAL, default=default_of(protocol, CONF_POLL_INTERVAL)
         ): quantity(0, LONGEST_POLL_INTERVAL, 0.1, "s"),
-        vol.Required(CONF_VOLTAGE, default=default_of(protocol, CONF_VOLTAGE)): (
-            quantity(100, 300, 0.1, "V")
-        ),
     }
+    if protocol.key not in _TELL_POWER:
+        form[vol.Required(CONF_VOLTAGE, default=default_of(protocol, CONF_VOLTAGE))] = (
+            quantity(100, 300, 0.1, "V")
+        )
     if not _lacks_fail_safe(protocol):
         form |= _LIFETIME
     if _has(protocol, CONF_COMMAND):
@@ -184,6 +212,8 @@ def check_charger(
     """
     errors = check_currents(typed)
     expert = typed[CONF_EXPERT]
+    if typed.get(CONF_PORTS) == "2" and CONF_INSTALLATION_LIMIT_2 not in typed:
+        errors[CONF_INSTALLATION_LIMIT_2] = "second_limit_missing"
     if not typed[CONF_NAME].strip():
         errors[CONF_NAME] = "name_empty"
     if not is_number(typed.get(CONF_ORDER_LIFETIME, 0)):
@@ -213,7 +243,7 @@ def _is_information(text: str | None) -> bool:
 
 
 def charger_data(
-    address: int, serial: str | None, typed: Mapping[str, Any]
+    address: Address, serial: str | None, typed: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Return a subentry's data of a filled-in and checked charger form."""
     expert = typed[CONF_EXPERT]
@@ -221,12 +251,17 @@ def charger_data(
         CONF_ADDRESS: address,
         CONF_SERIAL: serial,
         CONF_INSTALLATION_LIMIT: typed[CONF_INSTALLATION_LIMIT],
-        CONF_VOLTAGE: expert[CONF_VOLTAGE],
         CONF_POLL_INTERVAL: expert[CONF_POLL_INTERVAL],
         CONF_ORDER_LIFETIME: expert.get(
             CONF_ORDER_LIFETIME, typed.get(CONF_ORDER_LIFETIME)
         ),
     }
+    if CONF_VOLTAGE in expert:
+        data[CONF_VOLTAGE] = expert[CONF_VOLTAGE]
+    if CONF_PORTS in typed:
+        data[CONF_PORTS] = int(typed[CONF_PORTS])
+        if data[CONF_PORTS] > 1:
+            data[CONF_INSTALLATION_LIMIT_2] = typed[CONF_INSTALLATION_LIMIT_2]
     for key in (CONF_FAIL_SAFE_CURRENT, CONF_STOP_ON_SHUTDOWN):
         if key in typed:
             data[key] = typed[key]
@@ -262,7 +297,14 @@ def charger_suggestions(protocol: Protocol, subentry: ConfigSubentry) -> dict[st
         CONF_INSTALLATION_LIMIT: stored[CONF_INSTALLATION_LIMIT],
         CONF_EXPERT: expert,
     }
-    more = (CONF_SERIAL, CONF_ORDER_LIFETIME, CONF_STOP_ON_SHUTDOWN)
+    if CONF_PORTS in stored:
+        suggestions[CONF_PORTS] = str(stored[CONF_PORTS])
+    more = (
+        CONF_SERIAL,
+        CONF_INSTALLATION_LIMIT_2,
+        CONF_ORDER_LIFETIME,
+        CONF_STOP_ON_SHUTDOWN,
+    )
     return suggestions | {
         key: stored[key] for key in more if stored.get(key) is not None
     }
@@ -271,10 +313,11 @@ def charger_suggestions(protocol: Protocol, subentry: ConfigSubentry) -> dict[st
 def confirm_row(protocol: Protocol, charger: ConfigSubentryData) -> str:
     """Return a new charger as a row of the table that is confirmed last."""
     data = charger["data"]
+    limits = [f"{data[key]:g} A" for key in PORT_LIMITS if key in data]
     cells = [
         charger["title"].replace("|", "/"),
-        ADDRESSES[protocol.key].show(data[CONF_ADDRESS]),
-        f"{data[CONF_INSTALLATION_LIMIT]:g} A",
+        ADDRESSES[protocol.key].show(data[CONF_ADDRESS]) or NO,
+        " + ".join(limits),
         f"{data[CONF_FAIL_SAFE_CURRENT]:g} A",
     ]
     if CONF_FAIL_SAFE_TIMEOUT in data:

@@ -23,7 +23,7 @@ from .evse.errors import (
     PortPermissionError,
     PortSettingsError,
 )
-from .evse.found import ScanReport
+from .evse.found import Address, ScanReport
 from .evse.line import Line
 from .evse.model import ChargerConfig, CurrentLimit, Orders
 from .flow_address import ADDRESSES
@@ -87,7 +87,7 @@ def port_name(url: str) -> str:
 
 
 def imposed(
-    protocol: Protocol, addresses: Sequence[int], typed: Mapping[str, Any]
+    protocol: Protocol, addresses: Sequence[Address], typed: Mapping[str, Any]
 ) -> list[Imposed]:
     """Return what a search sets, of the values that the user has confirmed."""
     fail_safe = CurrentLimit(current=typed[CONF_FAIL_SAFE_CURRENT])
@@ -99,7 +99,7 @@ def imposed(
     more = {CONF_INSTALLATION_LIMIT: typed[CONF_INSTALLATION_LIMIT]}
     if CONF_COMMAND in typed:
         more[CONF_COMMAND] = int(typed[CONF_COMMAND])
-    return [(_config(protocol, address, more), orders) for address in addresses]
+    return [(_config(protocol, int(address), more), orders) for address in addresses]
 
 
 def nothing_imposed(protocol: Protocol) -> list[Imposed]:

@@ -28,6 +28,7 @@ from .const import (
     CONF_FAIL_SAFE_CURRENT,
     CONF_FAIL_SAFE_TIMEOUT,
     CONF_INSTALLATION_LIMIT,
+    CONF_INSTALLATION_LIMIT_2,
     CONF_PARITY,
     CONF_POLL_INTERVAL,
     CONF_PROTOCOL,
@@ -57,6 +58,7 @@ MAKES: Final[Mapping[str, tuple[str, ...]]] = {
     "evbox": ("evbox",),
     "abl": ("abl",),
     "smartevse": ("smartevse", "smartevse_master"),
+    "ews": ("ews", "ews_network"),
 }
 """What people choose first, and the protocols that it can then be."""
 
@@ -98,9 +100,10 @@ def dropdown(key: str, options: Iterable[str]) -> SelectSelector:
     )
 
 
-def suggest(key: str, value: object) -> vol.Required:
+def suggest(key: str, value: object, *, optional: bool = False) -> vol.Marker:
     """Return the key of a field that is filled in, but not taken unseen."""
-    return vol.Required(key, description={"suggested_value": value})
+    marker = vol.Optional if optional else vol.Required
+    return marker(key, description={"suggested_value": value})
 
 
 def default_of(protocol: Protocol, name: str) -> Any:  # noqa: ANN401 - any field's
@@ -125,7 +128,7 @@ def is_number(value: object) -> bool:
 
 def check_currents(typed: Mapping[str, Any]) -> Errors:
     """Return what is wrong with the currents of a form."""
-    keys = (CONF_INSTALLATION_LIMIT, CONF_FAIL_SAFE_CURRENT)
+    keys = (CONF_INSTALLATION_LIMIT, CONF_INSTALLATION_LIMIT_2, CONF_FAIL_SAFE_CURRENT)
     errors = {
         key: "not_a_number"
         for key in keys
@@ -133,10 +136,9 @@ def check_currents(typed: Mapping[str, Any]) -> Errors:
     }
     if errors:
         return errors
-    limit = typed[CONF_INSTALLATION_LIMIT]
-    return {
-        key: "above_installation_limit" for key in keys if typed.get(key, 0) > limit
-    }
+    if typed.get(CONF_FAIL_SAFE_CURRENT, 0) > typed[CONF_INSTALLATION_LIMIT]:
+        return {CONF_FAIL_SAFE_CURRENT: "above_installation_limit"}
+    return {}
 
 
 def check_timeout(typed: Mapping[str, Any], poll_interval: float) -> Errors:

@@ -6,14 +6,15 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from homeassistant.config_entries import ConfigSubentry, ConfigSubentryData
-from homeassistant.const import CONF_ADDRESS, CONF_DEVICE, CONF_NAME
+from homeassistant.const import CONF_ADDRESS, CONF_NAME
 from homeassistant.data_entry_flow import FlowContext, FlowHandler, FlowResult
 
 from .const import (
     CONF_INSTALLATION_LIMIT,
     SUBENTRY_CHARGER,
 )
-from .evse.found import ScanReport
+from .discovery import is_set_up
+from .evse.found import Address, ScanReport
 from .flow_address import ADDRESSES, Errors, manual_form, typed_addresses
 from .flow_charger import (
     Candidate,
@@ -32,6 +33,7 @@ from .flow_schema import (
     model_name,
 )
 from .flow_supply import supply_texts
+from .lines import line_name
 from .setup import charger_unique_id, line_settings
 
 if TYPE_CHECKING:
@@ -83,9 +85,13 @@ class ChargerSteps[
         """Return the chargers that the bus has already."""
         return []
 
-    def taken(self) -> set[int]:
+    def taken(self) -> set[Address]:
         """Return their addresses."""
         return {one.data[CONF_ADDRESS] for one in self.others()}
+
+    def waiting(self) -> list[str]:
+        """Return the addresses of those that have dialled and wait to be added."""
+        return []
 
     @property
     def several(self) -> bool:
@@ -207,7 +213,7 @@ class ChargerSteps[
     def placeholders(self) -> dict[str, str]:
         """Return what texts may name of the bus."""
         return {
-            "port": self.bus_data[CONF_DEVICE],
+            "port": line_name(self.bus_data),
             "protocol": self.protocol.name,
             "settings": str(line_settings(self.bus_data)),
         }
@@ -249,6 +255,10 @@ class ChargerSteps[
     ) -> ResultT:
         """Type where the chargers are."""
         errors = self.take_error()
+        form = ADDRESSES[self.protocol.key]
+        if form.optional and form.any is not None:
+            # There is one on such a line: the form for the charger asks the rest.
+            return await self.async_begin([Candidate(address=form.any)])
         if user_input is not None:
             addresses, errors = typed_addresses(self.protocol, user_input, self.taken())
             if not errors:
@@ -260,7 +270,8 @@ class ChargerSteps[
         return self.async_show_form(
             step_id="manual",
             data_schema=self.add_suggested_values_to_schema(
-                manual_form(self.protocol, multiple=self.several), user_input
+                manual_form(self.protocol, multiple=self.several, known=self.waiting()),
+                user_input,
             ),
             errors=errors,
             description_placeholders=self.placeholders(),
@@ -291,6 +302,7 @@ class ChargerSteps[
         offered = {
             CONF_NAME: default_name(self.protocol, candidate.address),
             address.one: address.show(candidate.address),
+            **candidate.suggestions(),
             **self.suggestions,
         }
         return self.async_show_form(
@@ -325,7 +337,9 @@ class ChargerSteps[
                 candidate = Candidate(address=addresses[0])
         serial = candidate.serial(self.protocol)
         identity = charger_unique_id(self.protocol.key, serial, candidate.address)
-        if identity in {one.unique_id for one in others}:
+        if identity in {one.unique_id for one in others} or (
+            self.protocol.dials_in and is_set_up(self.hass, identity)
+        ):
             errors["base"] = "already_configured"
         if not errors:
             self._ready.append(
@@ -374,4 +388,16 @@ class ChargerSteps[
         self, user_input: dict[str, Any] | None = None
     ) -> ResultT:
         """Store, now that the user knows that slaves stop without us."""
+        return self._confirm(user_input)
+
+    async def async_step_confirm_ews(
+        self, user_input: dict[str, Any] | None = None
+    ) -> ResultT:
+        """Store, now that the user knows what an EWS-Box does without its server."""
+        return self._confirm(user_input)
+
+    async def async_step_confirm_ews_network(
+        self, user_input: dict[str, Any] | None = None
+    ) -> ResultT:
+        """Store, now that the user knows what it does when it cannot dial."""
         return self._confirm(user_input)

@@ -25,6 +25,7 @@ SECOND_MASTER: Final = "second_master"
 WRONG_CHARGER: Final = "wrong_charger"
 DUPLICATE_ADDRESS: Final = "duplicate_address"
 SHARED_ADDRESS: Final = "shared_address"
+NO_SUCH_PORT: Final = "no_such_port"
 UNKNOWN_FIRMWARE: Final = "unknown_firmware"
 UNSUPPORTED_FIRMWARE: Final = "unsupported_firmware"
 
@@ -51,7 +52,7 @@ class BusIssues:
         """Note that a charger's stored orders were not there."""
         self._set(
             LOST,
-            unit.subentry_id,
+            unit.key,
             present=True,
             placeholders={
                 "charger": unit.name,
@@ -61,7 +62,7 @@ class BusIssues:
 
     def orders_renewed(self, unit: ChargerUnit) -> None:
         """Note that somebody has given a charger orders again."""
-        self._set(LOST, unit.subentry_id, present=False)
+        self._set(LOST, unit.key, present=False)
 
     def supply_lost(self, current: float) -> None:
         """Note that the stored order about a bus's supply was not there."""
@@ -91,14 +92,16 @@ class BusIssues:
         config = charger.config
         twice = Fault.DUPLICATE_ADDRESS in charger.faults
         noticed = {
-            WRONG_CHARGER: Fault.WRONG_CHARGER in charger.faults,
+            # Of a box with several ports, once.
+            WRONG_CHARGER: Fault.WRONG_CHARGER in charger.faults and unit.leads,
+            NO_SUCH_PORT: Fault.NO_SUCH_PORT in charger.faults,
             DUPLICATE_ADDRESS: twice and not charger.shares_address,
             SHARED_ADDRESS: twice and charger.shares_address,
         }
         for key, present in noticed.items():
             self._set(
                 key,
-                unit.subentry_id,
+                unit.key,
                 present=present,
                 placeholders={
                     "charger": unit.name,
@@ -117,7 +120,7 @@ class BusIssues:
         for key in (UNKNOWN_FIRMWARE, UNSUPPORTED_FIRMWARE):
             self._set(
                 key,
-                unit.subentry_id,
+                unit.key,
                 present=present and (key == UNKNOWN_FIRMWARE) == (firmware is None),
                 placeholders={
                     "charger": unit.name,
@@ -136,12 +139,12 @@ class BusIssues:
             return
         ordered = charger.effective_orders.fail_safe_timeout
         if ordered >= INTERVALS_PER_TIMEOUT * told:
-            self._set(TIMEOUT_RAISED, unit.subentry_id, present=False)
+            self._set(TIMEOUT_RAISED, unit.key, present=False)
             return
         used = charger.setpoint.fail_safe_timeout
         self._set(
             TIMEOUT_RAISED,
-            unit.subentry_id,
+            unit.key,
             present=used > ordered,
             placeholders={
                 "charger": unit.name,
@@ -153,7 +156,7 @@ class BusIssues:
 
     def forget(self, unit: ChargerUnit) -> None:
         """Delete the issues of a charger that is no more."""
-        for issue in [one for one in self._open if one.endswith(unit.subentry_id)]:
+        for issue in [one for one in self._open if one.endswith(unit.key)]:
             self._delete(issue)
 
     def clear(self) -> None:

@@ -37,6 +37,13 @@ _SMARTEVSE: Final = _Serials(
     unmistakable=False,
 )
 
+_EWS: Final = _Serials(
+    encode=str.encode,
+    # What tells it (`rs`) is not kept at all: it tells of cards, too.
+    in_frame=re.compile(rb"(?!)"),
+    rest=re.compile(rb"(?!)"),
+)
+
 _SERIALS: Final[Mapping[str, _Serials]] = {
     "evbox": _Serials(
         encode=lambda serial: serial.zfill(8).encode(),
@@ -52,6 +59,8 @@ _SERIALS: Final[Mapping[str, _Serials]] = {
     ),
     "smartevse": _SMARTEVSE,
     "smartevse_master": _SMARTEVSE,
+    "ews": _EWS,
+    "ews_network": _EWS,
 }
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Hashable, Iterable
 from dataclasses import dataclass
+from datetime import datetime
 from math import isfinite
 from typing import Any, TypeGuard, override
 
@@ -18,7 +19,6 @@ from homeassistant.util import dt as dt_util
 from .coordinator import (
     STATISTICS,
     BusCoordinator,
-    Context,
     EvseBusConfigEntry,
 )
 from .energy import MeterTotal, SummedTotal
@@ -30,18 +30,27 @@ from .entity import (
     add_charger_entities,
     supported,
 )
+from .evse.bus import Bus
+from .evse.ews import Listener
 from .evse.model import Capability, Fault
-from .sensor_tables import (
+from .lines import ListenerLines
+from .sensor_counts import (
     BUS_SENSORS,
-    CHARGER_SENSORS,
     CHARGER_STATISTICS,
+    CONNECTED_BOXES,
+    LISTENER_SENSORS,
+    BusSensorDescription,
+    ListenerSensorDescription,
+    StatisticDescription,
+)
+from .sensor_tables import (
+    CHARGER_SENSORS,
     CONNECTOR_SENSORS,
     ENERGY,
     ESTIMATED_ENERGY,
     FAULT,
     NO_FAULT,
     WAITING,
-    BusSensorDescription,
     ChargerSensorDescription,
     ConnectorSensorDescription,
 )
@@ -57,27 +66,45 @@ async def async_setup_entry(
 ) -> None:
     """Set up the sensors of a bus and of its chargers."""
     coordinator = entry.runtime_data
-    async_add_entities(
-        BusSensor(coordinator, description) for description in BUS_SENSORS
-    )
+    if coordinator.bus is not None:
+        async_add_entities(
+            BusSensor(coordinator, description, coordinator.bus)
+            for description in BUS_SENSORS
+        )
+    if isinstance(lines := coordinator.lines, ListenerLines):
+        async_add_entities([BoxesSensor(coordinator, lines)])
+        async_add_entities(
+            ListenerSensor(coordinator, description, lines.listener)
+            for description in LISTENER_SENSORS
+        )
     add_charger_entities(Platform.SENSOR, entry, async_add_entities, _sensors)
 
 
 def _sensors(coordinator: BusCoordinator, unit: ChargerUnit) -> Iterable[SensorEntity]:
     charger = unit.charger
-    for description in supported(charger, CHARGER_SENSORS):
+    yield from _line_sensors(coordinator, unit)
+    for description in supported(unit, CHARGER_SENSORS):
         yield ChargerSensor(coordinator, unit, description)
-    for description in CHARGER_STATISTICS:
-        yield ChargerStatistic(coordinator, unit, description, STATISTICS)
+    for statistic in CHARGER_STATISTICS:
+        yield ChargerStatistic(coordinator, unit, statistic)
     if Capability.FAULTS in charger.capabilities:
         yield FaultSensor(coordinator, unit, FAULT)
     for number in sorted(unit.numbers):
-        for connector_description in supported(charger, CONNECTOR_SENSORS):
+        for connector_description in supported(unit, CONNECTOR_SENSORS):
             yield ConnectorSensor(coordinator, unit, number, connector_description)
         if Capability.ENERGY in charger.capabilities:
             yield EnergySensor(coordinator, unit, number, ENERGY)
         if Capability.ESTIMATED_ENERGY in charger.capabilities:
             yield EstimatedEnergySensor(coordinator, unit, number, ESTIMATED_ENERGY)
+
+
+def _line_sensors(
+    coordinator: BusCoordinator, unit: ChargerUnit
+) -> Iterable[SensorEntity]:
+    """Return what is counted of the line that a box has for itself."""
+    if unit.leads and coordinator.bus is None:
+        for description in BUS_SENSORS:
+            yield LineSensor(coordinator, unit, description)
 
 
 class _ValueSensor(EvseBusEntity, SensorEntity):
@@ -89,25 +116,60 @@ class _ValueSensor(EvseBusEntity, SensorEntity):
         self._attr_native_value = value = self.value()
         return value
 
-    def value(self) -> str | float | None:
+    def value(self) -> str | float | datetime | None:
         """Return what to show."""
         raise NotImplementedError
 
 
 class BusSensor(BusEntity, _ValueSensor):
-    """A count of the bus."""
+    """A count of the bus of a port."""
 
     def __init__(
-        self, coordinator: BusCoordinator, description: BusSensorDescription
+        self, coordinator: BusCoordinator, description: BusSensorDescription, bus: Bus
     ) -> None:
         """Be told from time to time."""
         super().__init__(coordinator, description, STATISTICS)
         self._value = description.value
+        self._bus = bus
 
     @override
     def value(self) -> str | float | None:
         """Return what was counted."""
-        return self._value(self.coordinator)
+        return self._value(self._bus)
+
+
+class BoxesSensor(BusEntity, _ValueSensor):
+    """How many of the boxes of a listener are connected."""
+
+    def __init__(self, coordinator: BusCoordinator, lines: ListenerLines) -> None:
+        """Be told when one comes or goes."""
+        super().__init__(coordinator, CONNECTED_BOXES)
+        self._lines = lines
+
+    @override
+    def value(self) -> int:
+        """Return how many there are."""
+        return self._lines.connected
+
+
+class ListenerSensor(BusEntity, _ValueSensor):
+    """A count of a listener."""
+
+    def __init__(
+        self,
+        coordinator: BusCoordinator,
+        description: ListenerSensorDescription,
+        listener: Listener,
+    ) -> None:
+        """Be told from time to time."""
+        super().__init__(coordinator, description, STATISTICS)
+        self._value = description.value
+        self._listener = listener
+
+    @override
+    def value(self) -> str | float | None:
+        """Return what was counted."""
+        return self._value(self._listener)
 
 
 class ChargerSensor(ChargerEntity, _ValueSensor):
@@ -118,10 +180,9 @@ class ChargerSensor(ChargerEntity, _ValueSensor):
         coordinator: BusCoordinator,
         unit: ChargerUnit,
         description: ChargerSensorDescription,
-        context: Context | None = None,
     ) -> None:
-        """Be told with the charger, or in another context."""
-        super().__init__(coordinator, unit, description, context)
+        """Be told with the charger."""
+        super().__init__(coordinator, unit, description, whole=description.whole)
         self._value = description.value
 
     @override
@@ -130,13 +191,52 @@ class ChargerSensor(ChargerEntity, _ValueSensor):
         return self._value(self.charger)
 
 
-class ChargerStatistic(ChargerSensor):
+class ChargerStatistic(ChargerEntity, _ValueSensor):
     """A count about a charger; there also when the charger does not answer."""
+
+    def __init__(
+        self,
+        coordinator: BusCoordinator,
+        unit: ChargerUnit,
+        description: StatisticDescription,
+    ) -> None:
+        """Be told from time to time."""
+        super().__init__(coordinator, unit, description, STATISTICS)
+        self._value = description.value
 
     @override
     def is_available(self) -> bool:
         """Return true: how often it did not answer is best known then."""
         return True
+
+    @override
+    def value(self) -> str | float | None:
+        """Return what was counted."""
+        return self._value(self.charger)
+
+
+class LineSensor(ChargerEntity, _ValueSensor):
+    """A count of the line that a box has for itself."""
+
+    def __init__(
+        self,
+        coordinator: BusCoordinator,
+        unit: ChargerUnit,
+        description: BusSensorDescription,
+    ) -> None:
+        """Be told from time to time."""
+        super().__init__(coordinator, unit, description, STATISTICS, whole=True)
+        self._value = description.value
+
+    @override
+    def is_available(self) -> bool:
+        """Return true: a line that is down can still be told of."""
+        return True
+
+    @override
+    def value(self) -> str | float | None:
+        """Return what was counted."""
+        return self._value(self.unit.bus)
 
 
 class FaultSensor(ChargerEntity, SensorEntity):
@@ -177,7 +277,7 @@ class ConnectorSensor(ConnectorEntity, _ValueSensor):
         self._value = description.value
 
     @override
-    def value(self) -> str | float | None:
+    def value(self) -> str | float | datetime | None:
         """Return what the charger said."""
         reading = self.reading
         return None if reading is None else self._value(reading)

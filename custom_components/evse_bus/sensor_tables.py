@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from datetime import datetime
 from enum import StrEnum
 from typing import Any, Final
 
@@ -11,7 +12,6 @@ from homeassistant.components.sensor import (
     SensorStateClass,
 )
 from homeassistant.const import (
-    PERCENTAGE,
     EntityCategory,
     UnitOfElectricCurrent,
     UnitOfElectricPotential,
@@ -20,10 +20,10 @@ from homeassistant.const import (
     UnitOfTemperature,
     UnitOfTime,
 )
+from homeassistant.util import dt as dt_util
 
-from .coordinator import BusCoordinator
 from .evse.charger import Charger
-from .evse.model import Capability, Fault, Phases, Status
+from .evse.model import Capability, Fault, Phases, SessionResult, Status
 from .evse.readings import ChargerReading, ConnectorReading
 
 NO_FAULT: Final = "none"
@@ -40,21 +40,18 @@ class FailSafe(StrEnum):
     FALLS_BACK = "falls_back"
     """It charges with its fail-safe current after its time-out."""
     STOPS = "stops"
-
-
-@dataclass(frozen=True, kw_only=True)
-class BusSensorDescription(SensorEntityDescription):
-    """A count of the bus."""
-
-    value: Callable[[BusCoordinator], float | None]
+    ENDS = "ends"
+    """It ends the charge after 10 min, and unlocks the plug (EWS-Box)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ChargerSensorDescription(SensorEntityDescription):
-    """Something a charger says of itself, or that is counted about it."""
+    """Something a charger says of itself."""
 
     capability: Capability | None = None
     value: Callable[[Charger], str | float | None]
+    whole: bool = False
+    """Of the whole box, where that has several ports."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +59,7 @@ class ConnectorSensorDescription(SensorEntityDescription):
     """Something a charger says of one connector."""
 
     capability: Capability
-    value: Callable[[ConnectorReading], str | float | None]
+    value: Callable[[ConnectorReading], str | float | datetime | None]
 
 
 _CURRENT: Final[dict[str, Any]] = {
@@ -88,26 +85,26 @@ _POWER: Final[dict[str, Any]] = {
     "state_class": SensorStateClass.MEASUREMENT,
     "suggested_display_precision": 0,
 }
+_SESSION_ENERGY: Final[dict[str, Any]] = {
+    "device_class": SensorDeviceClass.ENERGY,
+    "native_unit_of_measurement": UnitOfEnergy.WATT_HOUR,
+    "suggested_unit_of_measurement": UnitOfEnergy.KILO_WATT_HOUR,
+    # Begins anew with each charge.
+    "state_class": SensorStateClass.TOTAL,
+    "suggested_display_precision": 2,
+}
+_SESSION_TIME: Final[dict[str, Any]] = {
+    "device_class": SensorDeviceClass.DURATION,
+    "native_unit_of_measurement": UnitOfTime.SECONDS,
+    "suggested_unit_of_measurement": UnitOfTime.MINUTES,
+    "suggested_display_precision": 0,
+}
 _ENERGY: Final[dict[str, Any]] = {
     "device_class": SensorDeviceClass.ENERGY,
     "native_unit_of_measurement": UnitOfEnergy.WATT_HOUR,
     "suggested_unit_of_measurement": UnitOfEnergy.KILO_WATT_HOUR,
     "state_class": SensorStateClass.TOTAL_INCREASING,
     "suggested_display_precision": 2,
-}
-_COUNT: Final[dict[str, Any]] = {
-    "entity_category": EntityCategory.DIAGNOSTIC,
-    "entity_registry_enabled_default": False,
-    "state_class": SensorStateClass.TOTAL_INCREASING,
-}
-_ROUND_TRIP: Final[dict[str, Any]] = {
-    "entity_category": EntityCategory.DIAGNOSTIC,
-    "entity_registry_enabled_default": False,
-    "device_class": SensorDeviceClass.DURATION,
-    "native_unit_of_measurement": UnitOfTime.SECONDS,
-    "suggested_unit_of_measurement": UnitOfTime.MILLISECONDS,
-    "state_class": SensorStateClass.MEASUREMENT,
-    "suggested_display_precision": 1,
 }
 
 
@@ -144,6 +141,28 @@ def _per_phase(
     )
 
 
+def _pilot(
+    key: str, value: Callable[[ConnectorReading], float | None]
+) -> ConnectorSensorDescription:
+    """Return the description of a voltage that only helps to find a fault."""
+    return ConnectorSensorDescription(
+        key=key,
+        translation_key=key,
+        entity_category=EntityCategory.DIAGNOSTIC,
+        entity_registry_enabled_default=False,
+        capability=Capability.PILOT_VOLTAGE,
+        value=value,
+        **_VOLTAGE,
+    )
+
+
+def _local(clock: datetime | None) -> datetime | None:
+    """Return what a box's clock showed as a time; it is kept in our zone."""
+    if clock is None:
+        return None
+    return clock.replace(tzinfo=dt_util.get_default_time_zone())
+
+
 def _fail_safe(charger: Charger) -> FailSafe | None:
     """Return what a charger does in silence; ``None``: that is not known yet."""
     # A fail-safe current alone may be just for orders that nobody renews.
@@ -152,6 +171,9 @@ def _fail_safe(charger: Charger) -> FailSafe | None:
     if charger.bus is not None and charger.bus.duty is not None:
         # A slave without its master.
         return FailSafe.STOPS
+    if Capability.SERVER in charger.capabilities:
+        ends = charger.ends_in_silence
+        return None if ends is None else FailSafe.ENDS if ends else FailSafe.NOTHING
     if Capability.UPSTREAM_TIMEOUT not in charger.capabilities:
         return FailSafe.NOTHING
     own = charger.info.options.get("upstream_timeout") if charger.info else None
@@ -206,6 +228,68 @@ CONNECTOR_SENSORS: Final[tuple[ConnectorSensorDescription, ...]] = (
         value=lambda reading: reading.minimum_current,
         **_CURRENT,
     ),
+    ConnectorSensorDescription(
+        key="cable_current",
+        translation_key="cable_current",
+        entity_category=EntityCategory.DIAGNOSTIC,
+        capability=Capability.CABLE_CURRENT,
+        value=lambda reading: reading.cable_current,
+        **_CURRENT,
+    ),
+    ConnectorSensorDescription(
+        key="session_energy",
+        translation_key="session_energy",
+        capability=Capability.SESSION,
+        value=lambda reading: reading.session_energy,
+        **_SESSION_ENERGY,
+    ),
+    ConnectorSensorDescription(
+        key="session_time",
+        translation_key="session_time",
+        capability=Capability.SESSION,
+        value=lambda reading: reading.session_time,
+        **_SESSION_TIME,
+    ),
+    ConnectorSensorDescription(
+        key="last_session_energy",
+        translation_key="last_session_energy",
+        capability=Capability.SESSION,
+        value=lambda reading: reading.last_session_energy,
+        **_SESSION_ENERGY,
+    ),
+    ConnectorSensorDescription(
+        key="last_session_time",
+        translation_key="last_session_time",
+        capability=Capability.SESSION,
+        value=lambda reading: reading.last_session_time,
+        **_SESSION_TIME,
+    ),
+    ConnectorSensorDescription(
+        key="last_result",
+        translation_key="last_result",
+        device_class=SensorDeviceClass.ENUM,
+        options=[str(result) for result in SessionResult],
+        capability=Capability.SESSION,
+        value=lambda reading: reading.last_result,
+    ),
+    ConnectorSensorDescription(
+        key="last_end",
+        translation_key="last_end",
+        device_class=SensorDeviceClass.TIMESTAMP,
+        capability=Capability.SESSION,
+        value=lambda reading: _local(reading.last_end),
+    ),
+    ConnectorSensorDescription(
+        key="user",
+        translation_key="user",
+        # Who charges where and when is private, and the recorder keeps it.
+        entity_registry_enabled_default=False,
+        capability=Capability.CARDS,
+        value=lambda reading: reading.user,
+    ),
+    _pilot("pilot_low", lambda reading: reading.pilot_low),
+    _pilot("pilot_high", lambda reading: reading.pilot_high),
+    _pilot("proximity_voltage", lambda reading: reading.proximity_voltage),
 )
 
 
@@ -246,6 +330,7 @@ CHARGER_SENSORS: Final[tuple[ChargerSensorDescription, ...]] = (
         device_class=SensorDeviceClass.ENUM,
         options=[str(one) for one in FailSafe],
         value=_fail_safe,
+        whole=True,
     ),
 )
 
@@ -255,112 +340,4 @@ FAULT: Final = SensorEntityDescription(
     entity_category=EntityCategory.DIAGNOSTIC,
     device_class=SensorDeviceClass.ENUM,
     options=[NO_FAULT, *(str(fault) for fault in Fault)],
-)
-
-CHARGER_STATISTICS: Final[tuple[ChargerSensorDescription, ...]] = (
-    ChargerSensorDescription(
-        key="requests",
-        translation_key="requests",
-        value=lambda charger: charger.statistics.requests,
-        **_COUNT,
-    ),
-    ChargerSensorDescription(
-        key="timeouts",
-        translation_key="timeouts",
-        value=lambda charger: charger.statistics.timeouts,
-        **_COUNT,
-    ),
-    ChargerSensorDescription(
-        key="bad_frames",
-        translation_key="bad_frames",
-        value=lambda charger: charger.statistics.bad_frames,
-        **_COUNT,
-    ),
-    ChargerSensorDescription(
-        key="reasserted",
-        translation_key="reasserted",
-        value=lambda charger: charger.statistics.reasserted,
-        **_COUNT,
-    ),
-    ChargerSensorDescription(
-        key="missed_deadlines",
-        translation_key="missed_deadlines",
-        value=lambda charger: charger.statistics.missed_deadlines,
-        **_COUNT,
-    ),
-    ChargerSensorDescription(
-        key="round_trip",
-        translation_key="round_trip",
-        value=lambda charger: charger.statistics.round_trip_mean,
-        **_ROUND_TRIP,
-    ),
-)
-
-
-def _mean_round_trip(coordinator: BusCoordinator) -> float | None:
-    """Return the mean time from a request to its answer, of all chargers, s."""
-    told = [charger.statistics for charger in coordinator.bus.chargers.values()]
-    replies = sum(statistics.replies for statistics in told)
-    total = sum(statistics.round_trip_sum for statistics in told)
-    return total / replies if replies else None
-
-
-def _utilisation(coordinator: BusCoordinator) -> float | None:
-    share = coordinator.bus.wire.statistics.utilisation(coordinator.hass.loop.time())
-    return None if share is None else share * 100
-
-
-BUS_SENSORS: Final[tuple[BusSensorDescription, ...]] = (
-    BusSensorDescription(
-        key="requests",
-        translation_key="requests",
-        value=lambda coordinator: coordinator.bus.wire.statistics.requests,
-        **_COUNT,
-    ),
-    BusSensorDescription(
-        key="timeouts",
-        translation_key="timeouts",
-        value=lambda coordinator: coordinator.bus.wire.statistics.timeouts,
-        **_COUNT,
-    ),
-    BusSensorDescription(
-        key="bad_frames",
-        translation_key="bad_frames",
-        value=lambda coordinator: coordinator.bus.wire.statistics.bad_frames,
-        **_COUNT,
-    ),
-    BusSensorDescription(
-        key="foreign_frames",
-        translation_key="foreign_frames",
-        value=lambda coordinator: coordinator.bus.wire.statistics.foreign_frames,
-        **_COUNT,
-    ),
-    BusSensorDescription(
-        key="missed_deadlines",
-        translation_key="missed_deadlines",
-        value=lambda coordinator: coordinator.bus.wire.statistics.missed_deadlines,
-        **_COUNT,
-    ),
-    BusSensorDescription(
-        key="reconnects",
-        translation_key="reconnects",
-        value=lambda coordinator: coordinator.bus.wire.statistics.reopened,
-        **_COUNT,
-    ),
-    BusSensorDescription(
-        key="round_trip",
-        translation_key="round_trip",
-        value=_mean_round_trip,
-        **_ROUND_TRIP,
-    ),
-    BusSensorDescription(
-        key="utilisation",
-        translation_key="utilisation",
-        entity_category=EntityCategory.DIAGNOSTIC,
-        entity_registry_enabled_default=False,
-        native_unit_of_measurement=PERCENTAGE,
-        state_class=SensorStateClass.MEASUREMENT,
-        suggested_display_precision=1,
-        value=_utilisation,
-    ),
 )

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
+from datetime import tzinfo
 from typing import TYPE_CHECKING, Any, Final
 
 from homeassistant.const import CONF_ADDRESS
@@ -13,10 +14,12 @@ from .const import (
     CONF_FAIL_SAFE_TIMEOUT,
     CONF_INFORMATION,
     CONF_INSTALLATION_LIMIT,
+    CONF_INSTALLATION_LIMIT_2,
     CONF_ORDER_LIFETIME,
     CONF_PARITY,
     CONF_PHASE_ORDER,
     CONF_POLL_INTERVAL,
+    CONF_PORTS,
     CONF_PROTOCOL,
     CONF_SERIAL,
     CONF_STOP_BITS,
@@ -60,12 +63,18 @@ _IN_PLACE: Final = (
     "poll_interval",
     "order_lifetime",
     "stop_on_shutdown",
+    "time_zone",
 )
 """What of its set-up a charger looks up anew each time."""
 _BUS_IN_PLACE: Final = (CONF_SUPPLY_LIMIT, CONF_SUPPLY_MINIMUM)
 """What can be changed while the bus runs: anew it would be silent for a while."""
 
 _DEFAULT_TIMEOUT: Final = 60
+
+PORT_LIMITS: Final = (CONF_INSTALLATION_LIMIT, CONF_INSTALLATION_LIMIT_2)
+"""Where the installation limit of each port of a box stands."""
+_FAMILIES: Final = {"ews_network": "ews"}
+"""Protocols under which one box may be found by the same serial number."""
 
 
 def protocol_of(data: Mapping[str, Any]) -> Protocol:
@@ -74,10 +83,12 @@ def protocol_of(data: Mapping[str, Any]) -> Protocol:
 
 
 def charger_unique_id(
-    protocol: str, serial: str | None, address: int | None = None
+    protocol: str, serial: str | None, address: int | str | None = None
 ) -> str:
     """Return a charger subentry's unique id: its identity, else its address."""
-    return f"{protocol}_address_{address}" if serial is None else f"{protocol}_{serial}"
+    if serial is None:
+        return f"{protocol}_address_{address}"
+    return f"{_FAMILIES.get(protocol, protocol)}_{serial}"
 
 
 def line_settings(data: Mapping[str, Any]) -> LineSettings:
@@ -105,34 +116,61 @@ def supply_of(data: Mapping[str, Any]) -> Supply | None:
     )
 
 
-def charger_config(data: Mapping[str, Any], subentry: ConfigSubentry) -> ChargerConfig:
-    """Return a charger's set-up, of the class that its protocol wants.
+def charger_configs(
+    data: Mapping[str, Any], subentry: ConfigSubentry, zone: tzinfo | None = None
+) -> list[ChargerConfig]:
+    """Return the set-up of a box, one for each port that is a charger of its own.
 
-    ``data`` is the config entry's, for the protocol.
+    ``data`` is the config entry's, for the protocol; ``zone`` is for the clocks of
+    boxes that have one.
     """
     stored = subentry.data
+    protocol = protocol_of(data)
     optional: dict[str, Any] = {
         key: convert(stored[key])
         for key, convert in _OPTIONAL_FIELDS.items()
         if stored.get(key) is not None
     }
-    return protocol_of(data).config(
-        key=subentry.subentry_id,
-        name=subentry.title,
-        address=int(stored[CONF_ADDRESS]),
-        installation_limit=float(stored[CONF_INSTALLATION_LIMIT]),
-        **optional,
-    )
+    if protocol.ports == 1:
+        one = protocol.config(
+            key=subentry.subentry_id,
+            name=subentry.title,
+            address=int(stored[CONF_ADDRESS]),
+            installation_limit=float(stored[CONF_INSTALLATION_LIMIT]),
+            **optional,
+        )
+        return [one]
+    count = port_count(stored)
+    clock: dict[str, Any] = {"time_zone": zone}
+    return [
+        protocol.config(
+            key=f"{subentry.subentry_id}_{port}",
+            name=subentry.title if count == 1 else f"{subentry.title} {port}",
+            address=port,
+            installation_limit=float(stored[limit]),
+            **optional,
+            **clock,
+        )
+        for port, limit in enumerate(PORT_LIMITS[:count], start=1)
+    ]
 
 
-def first_orders(subentry: ConfigSubentry) -> Orders:
+def port_count(stored: Mapping[str, Any]) -> int:
+    """Return how many ports of a box are used."""
+    return int(stored.get(CONF_PORTS, 1))
+
+
+def first_orders(subentry: ConfigSubentry, config: ChargerConfig) -> Orders:
     """Return the orders of a charger that never had any.
 
     They are the fail-safe values that the user confirmed when adding it. Nobody
     has said yet whether it may charge, so permission is the charger's own.
     """
     stored = subentry.data
-    fail_safe = float(stored.get(CONF_FAIL_SAFE_CURRENT, MINIMUM_CURRENT))
+    fail_safe = min(
+        float(stored.get(CONF_FAIL_SAFE_CURRENT, MINIMUM_CURRENT)),
+        config.installation_limit,
+    )
     return Orders(
         limit=CurrentLimit(current=fail_safe),
         fail_safe=CurrentLimit(current=fail_safe),

@@ -21,7 +21,7 @@ from .const import (
     SUBENTRY_CHARGER,
 )
 from .evse.errors import NotAvailableError
-from .evse.found import ScanReport
+from .evse.found import Address, ScanReport
 from .flow_address import ADDRESSES, Errors, typed_addresses
 from .flow_charger import (
     charger_data,
@@ -29,8 +29,10 @@ from .flow_charger import (
     charger_suggestions,
     check_charger,
 )
+from .flow_listener import found_box
 from .flow_scan import async_search, nothing_imposed
 from .flow_steps import ChargerSteps
+from .lines import Lines, ListenerLines
 from .setup import charger_unique_id, protocol_of
 
 if TYPE_CHECKING:
@@ -66,10 +68,10 @@ class ChargerSubentryFlow(
         self.protocol = protocol_of(entry.data)
         self.bus_data = dict(entry.data)
         if self._is_full():
-            return self.async_abort(reason="one_box")
+            return self.async_abort(reason=self._full_reason)
         # A search that sets limits is left to the charger's own first turn; and
         # the address that every box answers to is not for a bus with others on it.
-        searchable = not self.protocol.probe_imposes
+        searchable = not (self.protocol.probe_imposes or self.protocol.dials_in)
         if not searchable or entry.state is not ConfigEntryState.LOADED:
             return await self.async_step_manual()
         return self.async_show_menu(
@@ -78,19 +80,41 @@ class ChargerSubentryFlow(
             description_placeholders=self.placeholders(),
         )
 
+    @property
+    def _full_reason(self) -> str:
+        return "one_ews_box" if self.protocol.key == "ews" else "one_box"
+
     def _is_full(self) -> bool:
         """Return whether no further charger can be on this bus."""
         return ADDRESSES[self.protocol.key].alone and bool(self.others())
 
+    def _lines(self) -> Lines | None:
+        """Return the lines of the bus; ``None``: it is not set up now."""
+        entry: EvseBusConfigEntry = self._get_entry()
+        if entry.state is not ConfigEntryState.LOADED:
+            return None
+        return entry.runtime_data.lines
+
+    @override
+    def waiting(self) -> list[str]:
+        """Return the serial numbers of boxes that have dialled and are not set up."""
+        lines = self._lines()
+        if not isinstance(lines, ListenerLines):
+            return []
+        strangers = lines.listener.strangers
+        self._report = ScanReport(
+            found=tuple(found_box(one.serial, one.firmware) for one in strangers)
+        )
+        return [one.serial for one in strangers]
+
     @override
     async def async_scan(self, progress: Progress) -> ScanReport:
         """Search between the turns of the chargers that are running."""
-        entry: EvseBusConfigEntry = self._get_entry()
-        if entry.state is not ConfigEntryState.LOADED:
-            raise NotAvailableError(entry.title)
+        lines = self._lines()
+        if lines is None or lines.only is None:
+            raise NotAvailableError(self._get_entry().title)
         searches = nothing_imposed(self.protocol)
-        bus = entry.runtime_data.bus
-        return await async_search(self.protocol, bus, searches, progress)
+        return await async_search(self.protocol, lines.only, searches, progress)
 
     @override
     def finish(self, chargers: list[ConfigSubentryData]) -> SubentryFlowResult:
@@ -98,7 +122,7 @@ class ChargerSubentryFlow(
         [charger] = chargers
         # Another dialogue may have been quicker.
         if self._is_full():
-            return self.async_abort(reason="one_box")
+            return self.async_abort(reason=self._full_reason)
         if charger["data"][CONF_ADDRESS] in self.taken():
             return self.async_abort(reason="already_configured")
         return self.async_create_entry(
@@ -145,7 +169,7 @@ class ChargerSubentryFlow(
             description_placeholders={"name": subentry.title},
         )
 
-    def _serial(self, address: int, typed: dict[str, Any]) -> str | None:
+    def _serial(self, address: Address, typed: dict[str, Any]) -> str | None:
         form = ADDRESSES[self.protocol.key]
         if form.is_serial:
             return form.serial(address)

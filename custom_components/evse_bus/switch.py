@@ -10,10 +10,16 @@ from homeassistant.core import HomeAssistant
 from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
 
 from .coordinator import BusCoordinator, EvseBusConfigEntry
-from .entity import ChargerEntity, add_charger_entities, supported
+from .entity import (
+    ChargerEntity,
+    ConnectorEntity,
+    add_charger_entities,
+    supported,
+)
 from .errors import translated_errors
 from .evse.charger import Charger
 from .evse.model import Capability, Command, OrderChange
+from .evse.readings import ConnectorReading
 from .unit import ChargerUnit
 
 PARALLEL_UPDATES = 0
@@ -26,6 +32,16 @@ class CommandSwitchDescription(SwitchEntityDescription):
     capability: Capability
     command: Command
     value: Callable[[Charger], bool | None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConnectorSwitchDescription(SwitchEntityDescription):
+    """Something of one connector that commands set and a reading shows."""
+
+    capability: Capability
+    turn_on: tuple[Command, bool | None]
+    turn_off: tuple[Command, bool | None]
+    value: Callable[[ConnectorReading], bool | None]
 
 
 def _option(name: str) -> Callable[[Charger], bool | None]:
@@ -71,6 +87,26 @@ COMMANDS: Final[tuple[CommandSwitchDescription, ...]] = (
 )
 
 
+CONNECTOR_COMMANDS: Final[tuple[ConnectorSwitchDescription, ...]] = (
+    ConnectorSwitchDescription(
+        key="cable_lock",
+        translation_key="cable_lock",
+        capability=Capability.LOCK,
+        turn_on=(Command.LOCK, None),
+        turn_off=(Command.UNLOCK, None),
+        value=lambda reading: reading.locked,
+    ),
+    ConnectorSwitchDescription(
+        key="optimised_charging",
+        translation_key="optimised_charging",
+        capability=Capability.OPTIMISED,
+        turn_on=(Command.SET_OPTIMISED, True),
+        turn_off=(Command.SET_OPTIMISED, False),
+        value=lambda reading: reading.optimised,
+    ),
+)
+
+
 async def async_setup_entry(
     hass: HomeAssistant,  # noqa: ARG001 - Home Assistant's signature
     entry: EvseBusConfigEntry,
@@ -82,12 +118,15 @@ async def async_setup_entry(
 
 def _switches(coordinator: BusCoordinator, unit: ChargerUnit) -> Iterable[SwitchEntity]:
     yield AllowedSwitch(coordinator, unit, ALLOWED)
-    for description in supported(unit.charger, COMMANDS):
+    for description in supported(unit, COMMANDS):
         yield CommandSwitch(coordinator, unit, description)
+    for number in sorted(unit.numbers):
+        for connector_description in supported(unit, CONNECTOR_COMMANDS):
+            yield ConnectorSwitch(coordinator, unit, number, connector_description)
 
 
 class _ChargerSwitch(ChargerEntity, SwitchEntity):
-    """A switch of a charger."""
+    """A switch of a charger or of one of its connectors."""
 
     @override
     async def async_turn_on(self, **kwargs: Any) -> None:
@@ -153,3 +192,33 @@ class CommandSwitch(_ChargerSwitch):
     async def turn(self, *, on: bool) -> None:
         """Command it."""
         await self.charger.command(self._command, on)
+
+
+class ConnectorSwitch(ConnectorEntity, _ChargerSwitch):
+    """Something of one connector that commands set and a reading shows."""
+
+    def __init__(
+        self,
+        coordinator: BusCoordinator,
+        unit: ChargerUnit,
+        number: int,
+        description: ConnectorSwitchDescription,
+    ) -> None:
+        """Belong to the connector."""
+        super().__init__(coordinator, unit, number, description)
+        self._description = description
+
+    @override
+    def show(self) -> Hashable:
+        """Show what the charger says."""
+        reading = self.reading
+        value = None if reading is None else self._description.value(reading)
+        self._attr_is_on = value
+        return value
+
+    @override
+    async def turn(self, *, on: bool) -> None:
+        """Command it."""
+        description = self._description
+        command, value = description.turn_on if on else description.turn_off
+        await self.charger.command(command, value)

@@ -1,21 +1,35 @@
-"""One charger as the integration sees it."""
+"""One charger as the integration sees it: a box, or one port of a box."""
 
 from homeassistant.config_entries import ConfigSubentry
 from homeassistant.core import CALLBACK_TYPE
 
+from .evse.bus import Bus
 from .evse.charger import Charger
+from .evse.ews.events import Events
 from .evse.readings import ConnectorReading
+from .setup import port_count
 
 
 class ChargerUnit:
     """One charger and what the integration knows about it."""
 
-    def __init__(self, subentry: ConfigSubentry, charger: Charger) -> None:
-        """Start with nothing shown."""
+    def __init__(
+        self,
+        subentry: ConfigSubentry,
+        charger: Charger,
+        bus: Bus,
+        part: int | None = None,
+    ) -> None:
+        """Start with nothing shown; ``part``: see there."""
+        self.key = charger.config.key
+        """Its unique ids, its contexts and its orders begin with it."""
         self.subentry_id = subentry.subentry_id
         self.subentry = subentry
         self.charger = charger
         """The library's charger; another one after the set-up was changed."""
+        self.bus = bus
+        self.part = part
+        """Number of the port that it is; ``None``: it is a whole box."""
         self.device_id = ""
         self.split = False
         """Its connectors are devices of their own."""
@@ -27,12 +41,24 @@ class ChargerUnit:
         """Connectors seen since the start."""
         self.shape: object = None
         """What entities have been made for: capabilities, connectors and the like."""
+        self.events = Events()
+        """What happens at the charger, whichever object of the library it is now."""
         self.unsubscribe: CALLBACK_TYPE = lambda: None
 
     @property
     def name(self) -> str:
         """Return what the user calls it."""
         return self.charger.config.name
+
+    @property
+    def parts(self) -> int:
+        """Return how many ports of its box are used."""
+        return port_count(self.subentry.data)
+
+    @property
+    def leads(self) -> bool:
+        """Return whether it stands for its whole box."""
+        return self.part in (None, 1)
 
     def connector(self, number: int) -> ConnectorReading | None:
         """Return what is known of a connector now."""

@@ -117,6 +117,14 @@ class Charger(ABC):
         return False
 
     @property
+    def ends_in_silence(self) -> bool | None:
+        """Return whether it ends a charge that nobody looks after, of its own accord.
+
+        ``None``: not known (yet); only where it has a server that it may miss.
+        """
+        return None
+
+    @property
     def shares_address(self) -> bool:
         """Return whether others on its bus hear what is said to it, by their nature."""
         return False

@@ -4,13 +4,15 @@ from dataclasses import dataclass
 
 from .readings import ChargerInfo
 
+type Address = int | str
+"""Where a charger is on its bus; of a box that is alone there, its serial number."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FoundCharger:
     """A charger that answered a scan."""
 
-    address: int | str
-    """Where it is on its bus; of a box that is alone there, its serial number."""
+    address: Address
     info: ChargerInfo
     serial: str | None = None
     maximum_current: float | None = None

@@ -25,6 +25,7 @@ from .events import (
 )
 from .frames import LONGEST_FRAME
 from .limiting import Limiter
+from .parameters import SystemMode
 from .permission import Permission
 from .readings import capabilities_of, charger_info, charger_reading, limits_of
 from .session import EwsBox
@@ -89,6 +90,14 @@ class EwsReader(Charger):
     @override
     def waits_for_current(self) -> bool:
         return self.permission.waits_for_current
+
+    @property
+    @override
+    def ends_in_silence(self) -> bool | None:
+        installation = self.box.installation
+        if installation is None or installation.mode is None:
+            return None
+        return SystemMode.SERVER in installation.mode
 
     @property
     @override
@@ -208,6 +217,13 @@ class EwsReader(Charger):
         """
         await self.box.look(talk)
         return self.take()
+
+    async def look_now(self, talk: Talk) -> PortStatus:
+        """Look; once more if a record came that says it is not so any more."""
+        seen = await self.look(talk)
+        if self.box.ports_at == -inf:
+            seen = await self.look(talk)
+        return seen
 
     def take(self) -> PortStatus:
         """Make a reading of what the box told last.

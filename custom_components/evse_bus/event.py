@@ -1,0 +1,168 @@
+"""Events: keys, cards, starts that are asked for, charges that begin and end."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Final, override
+
+from homeassistant.components.event import (
+    ButtonEventType,
+    EventDeviceClass,
+    EventEntity,
+    EventEntityDescription,
+)
+from homeassistant.const import Platform
+from homeassistant.core import HomeAssistant, callback
+from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
+
+from .coordinator import BusCoordinator, EvseBusConfigEntry
+from .entity import ChargerEntity, add_charger_entities, supported
+from .evse.ews.events import (
+    CardPresented,
+    ChargeEnded,
+    ChargeStarted,
+    Event,
+    StartRequested,
+)
+from .evse.ews.info import KEYS, KeyEvent
+from .evse.model import Capability
+from .unit import ChargerUnit
+
+PARALLEL_UPDATES = 0
+
+type Told = tuple[str, Mapping[str, Any]]
+"""Type of an event, and what else is told of it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChargerEventDescription(EventEntityDescription):
+    """Something that happens at a charger."""
+
+    capability: Capability
+    take: Callable[[Event], Told | None]
+    """Return what to tell of an event; ``None``: it is of another kind."""
+    whole: bool = False
+
+
+def _key(number: int) -> ChargerEventDescription:
+    def take(event: Event) -> Told | None:
+        if not isinstance(event, KeyEvent) or event.key != number:
+            return None
+        if event.held is None:
+            return ButtonEventType.PRESS_START, {}
+        return ButtonEventType.PRESS_END, {"duration": event.held}
+
+    return ChargerEventDescription(
+        key=f"key_{number}",
+        translation_key="key",
+        translation_placeholders={"number": str(number)},
+        device_class=EventDeviceClass.BUTTON,
+        event_types=[ButtonEventType.PRESS_START, ButtonEventType.PRESS_END],
+        capability=Capability.KEYS,
+        take=take,
+    )
+
+
+def _charge(event: Event) -> Told | None:
+    if isinstance(event, ChargeStarted):
+        return "started", {}
+    if isinstance(event, ChargeEnded):
+        result = event.result
+        return "ended", {
+            "result": None if result is None else result.name.lower(),
+            "energy": event.energy,
+            "duration": event.duration,
+        }
+    return None
+
+
+def _start_request(event: Event) -> Told | None:
+    if not isinstance(event, StartRequested):
+        return None
+    told: dict[str, Any] = {"optimised": event.optimised}
+    if event.group is not None:
+        told |= {"group": event.group, "number": event.number}
+    return "requested", told
+
+
+def _card(event: Event) -> Told | None:
+    if not isinstance(event, CardPresented):
+        return None
+    # Whether the box calls it valid is not told: over Ethernet it always does.
+    told: dict[str, Any] = {"tag": event.tag.hex(), "readable": event.readable}
+    if event.readable:
+        told |= {"group": event.group, "number": event.number}
+    return "presented", told
+
+
+EVENTS: Final[tuple[ChargerEventDescription, ...]] = (
+    *(_key(number) for number in range(1, KEYS + 1)),
+    ChargerEventDescription(
+        key="charge",
+        translation_key="charge",
+        event_types=["started", "ended"],
+        capability=Capability.START_REQUEST,
+        take=_charge,
+    ),
+    ChargerEventDescription(
+        key="start_request",
+        translation_key="start_request",
+        event_types=["requested"],
+        capability=Capability.START_REQUEST,
+        take=_start_request,
+    ),
+    ChargerEventDescription(
+        key="card",
+        translation_key="card",
+        event_types=["presented"],
+        capability=Capability.CARDS,
+        take=_card,
+        whole=True,
+    ),
+)
+
+
+async def async_setup_entry(
+    hass: HomeAssistant,  # noqa: ARG001 - Home Assistant's signature
+    entry: EvseBusConfigEntry,
+    async_add_entities: AddConfigEntryEntitiesCallback,
+) -> None:
+    """Set up the events of a bus's chargers."""
+    add_charger_entities(Platform.EVENT, entry, async_add_entities, _events)
+
+
+def _events(coordinator: BusCoordinator, unit: ChargerUnit) -> Iterable[EventEntity]:
+    for description in supported(unit, EVENTS):
+        yield ChargerEvent(coordinator, unit, description)
+
+
+class ChargerEvent(ChargerEntity, EventEntity):
+    """Something that happens at a charger."""
+
+    def __init__(
+        self,
+        coordinator: BusCoordinator,
+        unit: ChargerUnit,
+        description: ChargerEventDescription,
+    ) -> None:
+        """Belong to the port, or to the whole box."""
+        super().__init__(coordinator, unit, description, whole=description.whole)
+        self._take = description.take
+
+    @override
+    async def async_added_to_hass(self) -> None:
+        """Listen."""
+        await super().async_added_to_hass()
+        self.async_on_remove(self.unit.events.subscribe(self._on_event))
+
+    @callback
+    def _on_event(self, event: Event) -> None:
+        """Tell an event of this kind."""
+        if (told := self._take(event)) is None:
+            return
+        event_type, attributes = told
+        self._trigger_event(event_type, dict(attributes))
+        self.async_write_ha_state()
+
+    @override
+    def show(self) -> None:
+        """Show nothing but that it is there: an event is told when it happens."""
