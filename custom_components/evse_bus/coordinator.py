@@ -207,9 +207,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         charger.commit = partial(self._async_commit, unit)
         stop = [charger.subscribe(partial(self._on_charger, unit))]
         if self.bus is None:
-            # Its own line comes and goes.
-            tell_line = partial(self._notify, (unit.key, None))
-            stop.append(unit.bus.subscribe(tell_line))
+            stop.append(unit.bus.subscribe(partial(self._on_line, unit)))
 
         def unsubscribe() -> None:
             while stop:
@@ -219,6 +217,13 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         unit.bus.add(charger)
         if isinstance(charger, EwsPort):
             stop.append(charger.subscribe_events(unit.events.tell))
+
+    @callback
+    def _on_line(self, unit: ChargerUnit) -> None:
+        """Tell that the line which a box has for itself has come or gone."""
+        self._notify((unit.key, None))
+        if unit.leads:
+            self._notify(BUS)
 
     async def _async_commit(self, unit: ChargerUnit, orders: Orders) -> None:
         self.issues.orders_renewed(unit)

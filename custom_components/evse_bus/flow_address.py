@@ -192,8 +192,8 @@ def typed_addresses(
         return [], {key: form.error}
     taken = set(taken)
     if not addresses:
-        left_out = form.optional and form.any is not None
-        return ([form.any], {}) if left_out else ([], {key: "no_address"})
+        left_out = [] if form.any is None or not form.optional else [form.any]
+        return left_out, {} if left_out else {key: "no_address"}
     if len(set(addresses)) < len(addresses):
         return [], {key: "address_twice"}
     if taken.intersection(addresses):
