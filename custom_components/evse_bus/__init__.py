@@ -3,11 +3,15 @@
 A config entry is one bus (one port), each charger on it is a config subentry.
 """
 
-from typing import Final
+from typing import Any, Final
 
 from homeassistant.config_entries import ConfigEntryState
-from homeassistant.const import EVENT_HOMEASSISTANT_STOP, Platform
-from homeassistant.core import HomeAssistant
+from homeassistant.const import (
+    EVENT_CORE_CONFIG_UPDATE,
+    EVENT_HOMEASSISTANT_STOP,
+    Platform,
+)
+from homeassistant.core import Event, HomeAssistant
 from homeassistant.helpers import config_validation as cv
 from homeassistant.helpers.device_registry import ChildDeviceEntry, DeviceEntry
 from homeassistant.helpers.typing import ConfigType
@@ -24,6 +28,7 @@ CONFIG_SCHEMA = cv.config_entry_only_config_schema(DOMAIN)
 PLATFORMS: Final = [
     Platform.BINARY_SENSOR,
     Platform.BUTTON,
+    Platform.EVENT,
     Platform.NUMBER,
     Platform.SELECT,
     Platform.SENSOR,
@@ -58,6 +63,13 @@ async def async_setup_entry(hass: HomeAssistant, entry: EvseBusConfigEntry) -> b
         await coordinator.async_stop()
         raise
     entry.async_on_unload(entry.add_update_listener(_async_updated))
+
+    async def follow_time_zone(_event: Event[Any]) -> None:
+        await coordinator.async_match_subentries()
+
+    entry.async_on_unload(
+        hass.bus.async_listen(EVENT_CORE_CONFIG_UPDATE, follow_time_zone)
+    )
     return True
 
 
