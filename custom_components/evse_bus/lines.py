@@ -5,6 +5,7 @@ and a scheduler, of its own: one that is slow or gone holds up nobody else.
 """
 
 from abc import ABC, abstractmethod
+import asyncio
 from collections.abc import Callable, Iterable, Mapping
 from ipaddress import ip_network
 from typing import TYPE_CHECKING, Any, override
@@ -136,8 +137,8 @@ class ListenerLines(Lines):
     async def stop(self) -> None:
         self._started = False
         await self.listener.stop()
-        for serial in tuple(self._buses):
-            await self._forget(serial)
+        # One that is in the midst of something does not hold up the others.
+        await asyncio.gather(*(self._forget(serial) for serial in tuple(self._buses)))
 
     @override
     async def join(self, config: ChargerConfig) -> Bus:
