@@ -26,6 +26,7 @@ ACTS = st.one_of(
     st.tuples(st.just("line"), st.just(None), WAITS),
     st.tuples(st.just("optimise"), st.booleans(), WAITS),
 )
+UNLOCKS = st.tuples(st.just("unlock"), st.just(None), WAITS)
 
 
 @dataclass
@@ -51,9 +52,9 @@ class Run:
         with suppress(EvseError):
             await self.scene.charger().change_orders(change)
 
-    async def optimise(self, value: object) -> None:
+    async def command(self, command: Command, value: bool | None = None) -> None:  # noqa: FBT001
         with suppress(EvseError):
-            await self.scene.charger().command(Command.SET_OPTIMISED, bool(value))
+            await self.scene.charger().command(command, value)
 
     async def act(self, what: str, value: object) -> None:
         if what == "allow":
@@ -76,14 +77,18 @@ class Run:
             assert isinstance(value, float)
             self.scene.line.held_until = now() + value
         elif what == "optimise":
-            self.tasks.append(asyncio.ensure_future(self.optimise(value)))
+            self.tasks.append(
+                asyncio.ensure_future(self.command(Command.SET_OPTIMISED, bool(value)))
+            )
+        elif what == "unlock":
+            self.tasks.append(asyncio.ensure_future(self.command(Command.UNLOCK)))
         else:
             self.scene.line.unplug()
 
 
 @settings(max_examples=50)
 @given(
-    acts=st.lists(ACTS, max_size=12),
+    acts=st.lists(ACTS, max_size=12) | st.lists(ACTS | UNLOCKS, max_size=12),
     pause_status=st.sampled_from((0x50, 0x42)),
     charging=st.booleans(),
 )
@@ -108,7 +113,8 @@ def test_any_orders(
         run.lost.clear()
         run.deaf.clear()
         await asyncio.sleep(60)
-        assert not scene.unlocked()
+        if not any(what == "unlock" for what, *_ in acts):
+            assert not scene.unlocked()
         assert not port.witness.unlocked_under_power
         said = scene.line.sent[begun:]
         assert all(one.parameters[1] for one in said if one.name == "st")

@@ -5,35 +5,49 @@ until it has followed. An answer that is lost decides nothing: the next look doe
 """
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from math import inf
 from typing import TYPE_CHECKING, Final
 
-from ..errors import NotConfirmedError, RefusedOrderError, ReplyTimeoutError
+from ..errors import (
+    NotAvailableError,
+    NotConfirmedError,
+    RefusedOrderError,
+    ReplyTimeoutError,
+    SupersededError,
+)
 from ..exchange import Talk
-from ..model import Command
+from ..model import Capability, Command
 from ..turns import Turns
 from .answers import decode_reset
-from .commands import reset, start_stop
-from .frames import CommandId
+from .commands import reset, start_stop, unlock
+from .frames import CommandId, Request
 from .readings import RUNNING
-from .states import StartStop
+from .states import StartStop, unlocks
 from .status import PortStatus, StartRelease
 from .timing import LOOK_AGAIN, SETTLING
 
 if TYPE_CHECKING:
     from .charger import EwsPort
 
-SENDS: Final = 2
+TRIES: Final = 10
+"""How often an order is about to be said, and something happens at the box then."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Order:
-    """An order, how it is seen to have worked, and whether it may be said twice."""
+    """An order, and how it is seen to have worked."""
 
-    order: StartStop
+    pick: Callable[[PortStatus], StartStop]
+    """Which order of ``sl`` it is, by how the port is."""
     done: Callable[[PortStatus], bool]
-    repeats: bool = True
+    sends: int = 2
+    """How often it may be said."""
+    unlocks: bool = False
+    """Nothing is said where the plug is free, and nothing twice before the lock had its
+    time."""
 
 
 def _stopped(seen: PortStatus) -> bool:
@@ -45,15 +59,33 @@ def _asked(seen: PortStatus) -> bool:
     return seen.start in known or seen.status in RUNNING
 
 
+def _always(order: StartStop) -> Callable[[PortStatus], StartStop]:
+    return lambda _seen: order
+
+
+def _how_to_unlock(seen: PortStatus) -> StartStop:
+    # 6 leaves a start that was asked for as it is.
+    return StartStop.PAUSE if unlocks(seen) else StartStop.STOP
+
+
 _ORDERS: Final[Mapping[Command, _Order]] = {
-    Command.STOP_AND_UNLOCK: _Order(StartStop.STOP, _stopped),
+    Command.STOP_AND_UNLOCK: _Order(pick=_always(StartStop.STOP), done=_stopped),
     # A second press of a key may mean something else.
-    Command.REQUEST_START: _Order(StartStop.REQUEST_START, _asked, repeats=False),
-    Command.LOCK: _Order(StartStop.LOCK, lambda seen: bool(seen.locked)),
+    Command.REQUEST_START: _Order(
+        pick=_always(StartStop.REQUEST_START), done=_asked, sends=1
+    ),
+    Command.LOCK: _Order(
+        pick=_always(StartStop.LOCK), done=lambda seen: bool(seen.locked)
+    ),
+    Command.UNLOCK: _Order(
+        pick=_how_to_unlock, done=lambda seen: not seen.locked, unlocks=True
+    ),
 }
 _OPTIMISED: Final[Mapping[bool, _Order]] = {
-    True: _Order(StartStop.OPTIMISE, lambda seen: seen.optimised),
-    False: _Order(StartStop.DO_NOT_OPTIMISE, lambda seen: not seen.optimised),
+    True: _Order(pick=_always(StartStop.OPTIMISE), done=lambda seen: seen.optimised),
+    False: _Order(
+        pick=_always(StartStop.DO_NOT_OPTIMISE), done=lambda seen: not seen.optimised
+    ),
 }
 
 
@@ -72,45 +104,66 @@ def conversation(
         if not isinstance(value, bool):
             message = f"{command} is true or false, not {value!r}"
             raise RefusedOrderError(message)
-        return partial(_give, port, _OPTIMISED[value])
+        return partial(_give, port, command, _OPTIMISED[value])
     order = _ORDERS.get(command)
-    return None if order is None else partial(_give, port, order)
+    return None if order is None else partial(_give, port, command, order)
 
 
-async def _give(port: EwsPort, order: _Order, talk: Talk) -> Turns:
+async def _give(port: EwsPort, command: Command, order: _Order, talk: Talk) -> Turns:
     """Give an order, and look until it is followed.
 
     Raises NotAvailableError where it may not be given, EwsRefusedError, and
     NotConfirmedError when the port does not follow.
     """
-    async for pause in port.ready(talk):
-        yield pause
-    seen = await port.look(talk)
-    for _ in range(SENDS if order.repeats else 1):
-        taken = await _say(port, order.order, seen, talk)
-        until = talk.now + SETTLING
-        while talk.now < until:
+    tries = sends = 0
+    patience = talk.now + SETTLING
+    until, answered = -inf, True
+    while True:
+        async for pause in port.ready(talk):
+            yield pause
+        if order.unlocks and Capability.LOCK not in port.capabilities:
+            message = f"{port.config.name} has no lock"
+            raise NotAvailableError(message)
+        try:
+            seen = await port.look_now(talk)
+        except ReplyTimeoutError:
+            if talk.now >= max(until, patience):
+                raise
             yield LOOK_AGAIN
-            async for pause in port.ready(talk):
-                yield pause
-            try:
-                seen = await port.look(talk)
-            except ReplyTimeoutError:
-                continue
-            if order.done(seen):
-                return
-            if not taken:
-                break
-    message = f"{port.config.name} does not follow: {order.order.name.lower()}"
-    raise NotConfirmedError(message)
+            continue
+        if order.done(seen) and (sends or order.unlocks):
+            break
+        if talk.now >= until or not (answered or order.unlocks):
+            if sends == order.sends or tries == TRIES:
+                message = f"{port.config.name} does not follow: {command}"
+                raise NotConfirmedError(message)
+            tries += 1
+            with suppress(SupersededError):
+                answered = await _say(port, order.pick(seen), seen, talk)
+                sends += 1
+                until = talk.now + SETTLING
+        yield LOOK_AGAIN
+    if order.unlocks and sends:
+        port.permission.forget()
 
 
 async def _say(port: EwsPort, order: StartStop, seen: PortStatus, talk: Talk) -> bool:
-    """Say it; return whether it was answered."""
+    """Say it; return whether it was answered.
+
+    Raises SupersededError, and says nothing, when a record has come since the look.
+    """
+    changes = port.box.changes
+    # What 6 does while something charges is a pause, and no business of this module.
+    make = unlock if order is StartStop.PAUSE else partial(start_stop, order=order)
+
+    def request() -> Request:
+        if port.box.changes != changes:
+            message = f"{port.config.name}: something happens there right now"
+            raise SupersededError(message)
+        return make(port.port, seen=seen)
+
     try:
-        await port.box.tell(
-            talk, CommandId.START_STOP, lambda: start_stop(port.port, order, seen)
-        )
+        await port.box.tell(talk, CommandId.START_STOP, request)
     except ReplyTimeoutError:
         return False
     if order is StartStop.STOP:

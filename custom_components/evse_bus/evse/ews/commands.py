@@ -13,7 +13,7 @@ from ..errors import RefusedOrderError
 from ..safety import Setpoint
 from .fields import Moment, Number
 from .frames import MAXIMUM_PARAMETERS, CommandId, Request
-from .states import StartStop, check_order
+from .states import StartStop, check_order, check_unlock
 from .status import PortStatus
 from .structs import Struct, many, part
 
@@ -83,6 +83,16 @@ def start_stop(
     """
     check_order(order, seen.status, paused=paused)
     return Request(CommandId.START_STOP, _PORT.encode(port) + bytes((order,)))
+
+
+def unlock(port: int, seen: PortStatus) -> Request:
+    """Return the order that unlocks a plug where nothing charges (``sl`` 6, 3.1.8).
+
+    The same order pauses where something does: ``seen`` is from an ``rc`` in the same
+    turn of the bus. Raises NotAvailableError where it would not unlock.
+    """
+    check_unlock(seen)
+    return Request(CommandId.START_STOP, _PORT.encode(port) + bytes((StartStop.PAUSE,)))
 
 
 MINIMUM_LIMIT: Final = 6

@@ -146,7 +146,7 @@ class Permission:
         while True:
             async for pause in port.ready(talk):
                 yield pause
-            seen = await self._look_now(talk)
+            seen = await port.look_now(talk)
             if not self._runs(seen):
                 break
             if talk.now >= self._said_at + SETTLING:
@@ -162,13 +162,6 @@ class Permission:
             self.paused = True
         if for_current and self.paused is not False:
             self.waits_for_current = seen.status in AFTER_OUR_PAUSE
-
-    async def _look_now(self, talk: Talk) -> PortStatus:
-        """Look; once more if a record came that says it is not so any more."""
-        seen = await self._port.look(talk)
-        if self._port.box.ports_at == -inf:
-            seen = await self._port.look(talk)
-        return seen
 
     async def _say_pause(self, talk: Talk, seen: PortStatus) -> None:
         port = self._port
@@ -226,7 +219,7 @@ class Permission:
         while True:
             async for pause in port.ready(talk):
                 yield pause
-            seen = await self._look_now(talk)
+            seen = await port.look_now(talk)
             settled = said_at is None or talk.now >= said_at + SETTLING
             if self._has_started(seen, settled=settled):
                 break

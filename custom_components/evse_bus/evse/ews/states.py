@@ -12,7 +12,7 @@ from typing import Final
 from ..errors import NotAvailableError
 from ..model import Fault, Status
 from .box import BoxFlags, BoxStatus
-from .status import ChargeResult, PortStatus
+from .status import ChargeResult, PortStatus, StartRelease
 
 FREE: Final = 0x00
 SEARCHING: Final = 0x10
@@ -186,7 +186,8 @@ class StartStop(IntEnum):
     OPTIMISE = 4
     DO_NOT_OPTIMISE = 5
     PAUSE = 6
-    """Stop and stay locked. Where nothing charges it unlocks: never sent there."""
+    """Stop and stay locked. Where nothing charges it unlocks: sent there only by
+    `commands.unlock`."""
     LOCK = 7
 
 
@@ -206,6 +207,9 @@ _OPTIMISABLE: Final = Rule(
     _RUNNING | {FREE, SEARCHING, WAITING, ENDED},
     "a port out of order has no next start",
 )
+
+UNLOCKED_BY_6: Final = frozenset({WAITING, ENDED})
+"""Where order 6 does not pause but unlocks."""
 
 RULES: Final[Mapping[StartStop, Rule]] = {
     # A stop is sent wherever it may be heard, also in states nobody knows.
@@ -246,5 +250,24 @@ def check_order(order: StartStop, status: int, *, paused: bool = False) -> None:
         message = (
             f"not in state {state_of(status).name}: "
             f"{order.name.lower().replace('_', ' ')}: {RULES[order].why}"
+        )
+        raise NotAvailableError(message)
+
+
+def unlocks(seen: PortStatus) -> bool:
+    """Return whether order 6 would unlock a locked plug here, and not pause (3.1.8).
+
+    A start that is released is about to charge: then it might do either.
+    """
+    starts = seen.status == WAITING and seen.start is StartRelease.RELEASED
+    return seen.status in UNLOCKED_BY_6 and not starts
+
+
+def check_unlock(seen: PortStatus) -> None:
+    """Raise NotAvailableError where order 6 would not unlock (see `unlocks`)."""
+    if not (seen.locked and unlocks(seen)):
+        message = (
+            f"not in state {state_of(seen.status).name}: unlock: it is for a locked "
+            "plug, and pauses where something charges"
         )
         raise NotAvailableError(message)
