@@ -89,8 +89,6 @@ _SESSION_ENERGY: Final[dict[str, Any]] = {
     "device_class": SensorDeviceClass.ENERGY,
     "native_unit_of_measurement": UnitOfEnergy.WATT_HOUR,
     "suggested_unit_of_measurement": UnitOfEnergy.KILO_WATT_HOUR,
-    # Begins anew with each charge.
-    "state_class": SensorStateClass.TOTAL,
     "suggested_display_precision": 2,
 }
 _SESSION_TIME: Final[dict[str, Any]] = {
@@ -241,6 +239,8 @@ CONNECTOR_SENSORS: Final[tuple[ConnectorSensorDescription, ...]] = (
         translation_key="session_energy",
         capability=Capability.SESSION,
         value=lambda reading: reading.session_energy,
+        # Begins anew with each charge, which this class is made for.
+        state_class=SensorStateClass.TOTAL_INCREASING,
         **_SESSION_ENERGY,
     ),
     ConnectorSensorDescription(
