@@ -16,7 +16,12 @@ from custom_components.evse_bus import (
     sensor_tables,
     switch as switches,
 )
-from custom_components.evse_bus.errors import _COMMAND_KEYS, _PORT_KEYS
+from custom_components.evse_bus.errors import (
+    _COMMAND_KEYS,
+    _PORT_KEYS,
+    EWS_KEYS,
+    ActionError,
+)
 from custom_components.evse_bus.issues import (
     DUPLICATE_ADDRESS,
     LOST,
@@ -104,10 +109,12 @@ def test_icons_belong_to_entities(platform: str) -> None:
 def test_errors_have_texts() -> None:
     texts = english()["exceptions"]
     keys = {key for _, key in (*_PORT_KEYS, *_COMMAND_KEYS)}
-    assert keys == texts.keys()
+    assert keys | set(EWS_KEYS.values()) | set(ActionError) == texts.keys()
     placeholders = dict.fromkeys(("charger", "port", "error", "expected", "found"), "x")
-    for text in texts.values():
-        assert text["message"].format(**placeholders)
+    for key in keys:
+        assert texts[key]["message"].format(**placeholders, secrets="x")
+    for key in EWS_KEYS.values():
+        assert texts[key]["message"].format(charger="x", code="x")
 
 
 def test_issues_have_texts() -> None:

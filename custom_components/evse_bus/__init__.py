@@ -21,6 +21,7 @@ from .coordinator import BusCoordinator, EvseBusConfigEntry
 from .errors import not_ready
 from .evse.errors import LineError
 from .orders import OrderStore
+from .services import async_register
 from .setup import made_of
 
 CONFIG_SCHEMA = cv.config_entry_only_config_schema(DOMAIN)
@@ -37,10 +38,11 @@ PLATFORMS: Final = [
 
 
 async def async_setup(
-    hass: HomeAssistant,  # noqa: ARG001 - Home Assistant's signature
+    hass: HomeAssistant,
     config: ConfigType,  # noqa: ARG001 - there is no YAML
 ) -> bool:
-    """Set up nothing: everything belongs to a bus."""
+    """Set up the actions; everything else belongs to a bus."""
+    async_register(hass)
     return True
 
 

@@ -1,7 +1,8 @@
 """What went wrong, in the user's words: library errors as Home Assistant's."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from enum import StrEnum
 from typing import Final
 
 from homeassistant.exceptions import (
@@ -32,6 +33,8 @@ from .evse.errors import (
     SupersededError,
     WrongChargerError,
 )
+from .evse.ews.answers import EwsRefusedError, Refusal
+from .evse.ews.parameters import HiddenSecretError
 
 # The first class that fits counts, so the special stand before the general.
 _PORT_KEYS: Final[tuple[tuple[type[LineError], str], ...]] = (
@@ -43,6 +46,7 @@ _PORT_KEYS: Final[tuple[tuple[type[LineError], str], ...]] = (
 )
 
 _COMMAND_KEYS: Final[tuple[tuple[type[EvseError], str], ...]] = (
+    (HiddenSecretError, "ews_secret_hidden"),
     (RefusedOrderError, "order_refused"),
     (SupersededError, "superseded"),
     (WrongChargerError, "wrong_charger"),
@@ -59,6 +63,57 @@ _COMMAND_KEYS: Final[tuple[tuple[type[EvseError], str], ...]] = (
     (NotAvailableError, "not_available"),
     (EvseError, "command_failed"),
 )
+
+EWS_KEYS: Final[Mapping[Refusal, str]] = {reason: f"ews_{reason}" for reason in Refusal}
+"""An EWS-Box says why it refuses: each reason has a text that says what to do."""
+
+
+class ActionError(StrEnum):
+    """What is wrong with what an action was given, or with what came of it."""
+
+    NOT_EWS_BOX = "not_ews_box"
+    CHOOSE_PORT = "choose_port"
+    NOTHING_TO_CHANGE = "nothing_to_change"
+    NOT_READ = "not_read"
+    PARAMETERS_NOT_TAKEN = "parameters_not_taken"
+    CARDS_NOT_TAKEN = "cards_not_taken"
+    CARD_ENTRIES = "card_entries"
+    CARD_ENTRY_TWICE = "card_entry_twice"
+    CARD_ENTRY_NUMBERS = "card_entry_numbers"
+    LED_TIMES = "led_times"
+    FIELD_NUMBER = "field_number"
+    FIELD_WHOLE_NUMBER = "field_whole_number"
+    FIELD_CURRENT = "field_current"
+    FIELD_TEXT = "field_text"
+    FIELD_SIGNS = "field_signs"
+    FIELD_PIN = "field_pin"
+    FIELD_TAG = "field_tag"
+    FIELD_ADDRESS = "field_address"
+    FIELD_NETMASK = "field_netmask"
+    FIELD_SWITCH = "field_switch"
+    FIELD_OPTION = "field_option"
+
+
+def wrong_action(key: ActionError, **placeholders: object) -> ServiceValidationError:
+    """Return the error for an action that cannot be meant."""
+    return ServiceValidationError(
+        translation_domain=DOMAIN,
+        translation_key=key.value,
+        translation_placeholders=_as_texts(placeholders),
+    )
+
+
+def failed_action(key: ActionError, **placeholders: object) -> HomeAssistantError:
+    """Return the error for an action that could not be carried out."""
+    return HomeAssistantError(
+        translation_domain=DOMAIN,
+        translation_key=key.value,
+        translation_placeholders=_as_texts(placeholders),
+    )
+
+
+def _as_texts(placeholders: Mapping[str, object]) -> dict[str, str]:
+    return {name: str(value) for name, value in placeholders.items()}
 
 
 def port_error_key(error: LineError) -> str:
@@ -85,8 +140,14 @@ def translated_errors(charger: str, port: str) -> Iterator[None]:
     try:
         yield
     except EvseError as error:
-        key = next(key for kind, key in _COMMAND_KEYS if isinstance(error, kind))
         placeholders = {"charger": charger, "port": port, "error": str(error)}
+        if isinstance(error, EwsRefusedError):
+            key = EWS_KEYS[error.reason]
+            placeholders["code"] = str(error.code)
+        else:
+            key = next(key for kind, key in _COMMAND_KEYS if isinstance(error, kind))
+        if isinstance(error, HiddenSecretError):
+            placeholders["secrets"] = ", ".join(error.names)
         if isinstance(error, WrongChargerError):
             placeholders |= {
                 "expected": error.expected or "-",

@@ -1,0 +1,82 @@
+"""Action for the LEDs of an EWS-Box that has given them to its server."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Final
+
+from .actions_fields import option, whole
+from .errors import ActionError, wrong_action
+from .evse.ews.commands import (
+    LED_OFF,
+    LED_ON,
+    LED_UNCHANGED,
+    Led,
+    PortLeds,
+    blinking,
+)
+
+if TYPE_CHECKING:
+    from .evse.ews import EwsPort
+
+LEDS: Final = ("red", "green", "orange", "spare")
+UNCHANGED: Final = "unchanged"
+BLINK: Final = "blink"
+STATES: Final[Mapping[str, Led | None]] = {
+    "on": LED_ON,
+    "off": LED_OFF,
+    BLINK: None,
+    UNCHANGED: LED_UNCHANGED,
+}
+LONGEST: Final = 0xFFFE
+"""ms; one more means always."""
+DEFAULT_TIME: Final = 500
+"""ms"""
+TIMES: Final[Mapping[str, tuple[int, int, int]]] = {
+    "time_on": (1, LONGEST, DEFAULT_TIME),
+    "time_off": (1, LONGEST, DEFAULT_TIME),
+    "offset": (0, LONGEST, 0),
+}
+"""Lowest, highest and usual value of what stands behind the name of an LED, ms."""
+
+
+def time_keys(led: str) -> tuple[str, ...]:
+    """Return the names of the fields for the times of an LED."""
+    return tuple(f"{led}_{name}" for name in TIMES)
+
+
+FIELDS: Final = (*LEDS, *(key for led in LEDS for key in time_keys(led)))
+
+
+async def set_leds(port: EwsPort, given: Mapping[str, object]) -> None:
+    """Set LEDs of one port; the other port's stay as they are."""
+    leds = port_leds(given)
+    other = PortLeds()
+    if leds == other:
+        raise wrong_action(ActionError.NOTHING_TO_CHANGE)
+    first, second = (leds, other) if port.port == 1 else (other, leds)
+    await port.services.set_leds(first, second)
+
+
+def port_leds(given: Mapping[str, object]) -> PortLeds:
+    """Return what the LEDs are to do; raises ServiceValidationError."""
+    return PortLeds(**{led: _led(led, given) for led in LEDS})
+
+
+def _led(led: str, given: Mapping[str, object]) -> Led:
+    state = given.get(led, UNCHANGED)
+    if isinstance(state, bool):
+        # YAML takes the words on and off for these.
+        state = "on" if state else "off"
+    steady = option(STATES)(led, state)
+    if steady is None:
+        return blinking(
+            *(
+                whole(lowest, highest)(key, given.get(key, usual))
+                for key, (lowest, highest, usual) in zip(
+                    time_keys(led), TIMES.values(), strict=True
+                )
+            )
+        )
+    for key in time_keys(led):
+        if key in given:
+            raise wrong_action(ActionError.LED_TIMES, field=key, led=led, state=BLINK)
+    return steady
