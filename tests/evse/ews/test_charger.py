@@ -71,25 +71,6 @@ def test_one_rc_tells_of_both_ports() -> None:
     play(EwsScene(), acts)
 
 
-def test_a_box_with_one_port() -> None:
-    async def acts(scene: EwsScene) -> None:
-        await asyncio.sleep(30)
-        assert scene.charger().available
-        assert not scene.charger(2).available
-        await scene.charger().change_orders(amperes(10.0))
-        with pytest.raises(EvseError):
-            await scene.charger(2).change_orders(amperes(10.0))
-        assert not scene.line.limits(2)
-
-    async def run() -> None:
-        scene = EwsScene(options={"ports": 1})
-        async with scene:
-            await scene.until(lambda: scene.charger().reading is not None)
-            await acts(scene)
-
-    simulate(run())
-
-
 def test_a_household_socket_gives_16_amperes_or_none() -> None:
     async def acts(scene: EwsScene) -> None:
         assert Capability.OFFERED_CURRENT not in scene.charger().capabilities

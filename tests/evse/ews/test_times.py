@@ -1,6 +1,7 @@
 """When a box is asked, and what its silence means."""
 
 import asyncio
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -37,6 +38,22 @@ def test_the_box_never_waits_for_30_seconds(interval: float) -> None:
         assert scene.box.server_connected
 
     play(EwsScene(timing=TCP_TIMING, config={"poll_interval": interval}), acts)
+
+
+def test_a_slow_first_port_holds_up_nobody() -> None:
+    """The box's deadline is the first port's, and moves with what the other says."""
+
+    async def acts(scene: EwsScene) -> None:
+        port = scene.charger()
+        port.set_up(replace(port.config, poll_interval=300.0))
+        await asyncio.sleep(3)
+        begin = now()
+        await asyncio.sleep(120)
+        looks = [begin, *(one.when for one in scene.line.named("rc", since=begin))]
+        assert max(later - sooner for sooner, later in pairwise(looks)) < 4
+        assert scene.bus.wire.statistics.missed_deadlines == 0
+
+    play(EwsScene(timing=TCP_TIMING), acts)
 
 
 def test_commands_that_never_end_keep_no_poll_from_its_deadline() -> None:

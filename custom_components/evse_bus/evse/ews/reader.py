@@ -150,19 +150,21 @@ class EwsReader(Charger):
         self._meet_deadline(now)
 
     def _meet_deadline(self, now: float) -> None:
-        """Let the box never wait for 30 s: one port's deadline is the box's."""
-        slot = self.slot
+        """Let the box never wait for 30 s: the first port's deadline is the box's.
+
+        It moves with what any port says, or the others would wait for it in vain.
+        """
+        self.slot.start_by = inf
+        if self.bus is None:
+            return
+        slot = next(iter(self.bus.chargers.values()), self).slot
         deadline = self.box.heard_at + COMMAND_TIMEOUT - COMMAND_MARGIN
-        slot.start_by = inf
-        if self._leads and deadline > now:
+        if deadline > now:
             slot.ready = min(slot.ready, deadline - _SOONER)
             slot.due = min(slot.due, deadline - _SOONER)
             slot.start_by = deadline
-
-    @property
-    def _leads(self) -> bool:
-        bus = self.bus
-        return bus is not None and next(iter(bus.chargers.values()), None) is self
+        else:
+            slot.start_by = inf
 
     def hurry(self, at: float = -inf) -> None:
         """Poll as soon as the bus is free, but not before a loop time."""
@@ -232,7 +234,10 @@ class EwsReader(Charger):
         """
         self._check_identity()
         box = self.box
+        installed = box.installation.ports if box.installation else self.port
+        self.tell(Fault.NO_SUCH_PORT, present=installed < self.port)
         if len(box.ports) < self.port:
+            self.set_unavailable()
             message = f"{self.config.name}: the box has no port {self.port}"
             raise NotAvailableError(message)
         before, seen = self.seen, box.ports[self.port - 1]
