@@ -1,6 +1,7 @@
 """The clock, and what a person orders once."""
 
 import asyncio
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 import logging
 from zoneinfo import ZoneInfo
@@ -13,7 +14,9 @@ from custom_components.evse_bus.evse.errors import (
     RefusedOrderError,
 )
 from custom_components.evse_bus.evse.ews import session
+from custom_components.evse_bus.evse.ews.config import EwsPortConfig, ews_config
 from custom_components.evse_bus.evse.model import (
+    ChargerConfig,
     Command,
     Fault,
     OrderChange,
@@ -59,6 +62,35 @@ def test_the_clock_is_kept_right(monkeypatch: pytest.MonkeyPatch) -> None:
             await acts(scene)
 
     simulate(run())
+
+
+def test_the_zone_may_change_while_it_runs() -> None:
+    """At once, though a clock is set once an hour at most."""
+    right = datetime(2026, 7, 1, 10, 0, tzinfo=UTC)
+
+    async def acts(scene: EwsScene) -> None:
+        begin = now()
+        port = scene.charger()
+        port.box.clock = lambda: right + timedelta(seconds=now() - begin)
+        for zone, hour, sets in (
+            ("Europe/Berlin", 12, 1),
+            ("Europe/Paris", 12, 1),
+            ("Europe/London", 11, 2),
+            (None, 11, 2),
+            ("Europe/Lisbon", 11, 2),
+            ("Asia/Tokyo", 19, 3),
+        ):
+            known = None if zone is None else ZoneInfo(zone)
+            config = ews_config(port.config)
+            port.set_up(replace(config, time_zone=known))
+            await asyncio.sleep(30)
+            assert scene.box.clock().hour == hour, zone
+            assert len(scene.line.named("sc")) == sets, zone
+        with pytest.raises(TypeError):
+            port.set_up(ChargerConfig(key="a", name="a", address=1))
+        assert isinstance(port.config, EwsPortConfig)
+
+    play(EwsScene(), acts)
 
 
 def test_without_a_zone_the_clock_is_left_alone() -> None:

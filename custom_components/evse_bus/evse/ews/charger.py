@@ -53,6 +53,13 @@ class EwsPort(EwsReader):
         super().on_line_open()
         self._urgent_waits = False
 
+    @override
+    def set_up(self, config: ChargerConfig) -> None:
+        zone = ews_config(config).time_zone
+        if zone != ews_config(self.config).time_zone:
+            self.box.check_clock()
+        super().set_up(config)
+
     # -- The regular exchange ------------------------------------------------------
 
     @override

@@ -329,6 +329,10 @@ class EwsBox:
         off = (self._local(zone) - status.clock).total_seconds()
         return abs(off) > CLOCK_TOLERANCE
 
+    def check_clock(self) -> None:
+        """Let its clock be set soon if it is wrong: it is to show another zone."""
+        self._clock_after = -inf
+
     async def set_clock(self, talk: Talk, zone: tzinfo) -> None:
         """Set its clock to the time in this zone.
 
