@@ -9,7 +9,7 @@ from functools import partial
 import logging
 
 from .info import KeyEvent
-from .status import ChargeResult
+from .status import ChargeResult, PortStatus
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -35,6 +35,12 @@ class StartRequested:
     """Somebody wants to charge, and waits for our permission."""
 
     port: int
+    optimised: bool
+    """They want an optimised charge."""
+    group: int | None = field(default=None, repr=False)
+    """Of the card that is logged in at the port; ``None``: no card is."""
+    number: int | None = field(default=None, repr=False)
+    """Within its group."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,6 +57,10 @@ class ChargeEnded:
     port: int
     result: ChargeResult | None
     """Why; ``None``: not told, or by a code that the manual does not know."""
+    energy: int
+    """Wh"""
+    duration: int
+    """s, as the box counts it."""
 
 
 type Event = KeyEvent | CardPresented | StartRequested | ChargeStarted | ChargeEnded
@@ -76,6 +86,37 @@ class Events:
                 listener(event)
             except Exception:
                 _LOGGER.exception("A listener failed")
+
+
+def start_requested(port: int, seen: PortStatus) -> StartRequested:
+    """Return that a start is asked for, by whoever is logged in there."""
+    card = seen.card
+    return StartRequested(
+        port=port,
+        optimised=seen.optimised,
+        group=None if card is None else card.group,
+        number=None if card is None else card.number,
+    )
+
+
+def charge_ended(
+    port: int, running: PortStatus | None, seen: PortStatus
+) -> ChargeEnded:
+    """Return that a charge has ended, by how the port was while it ran, and is now.
+
+    The manual does not say when the box takes a charge over as its last one, nor when
+    the counters of the charge under way begin anew (docs/ews.md).
+    """
+    time, energy = seen.last_time, seen.last_energy
+    if running is not None and (time, energy) == (
+        running.last_time,
+        running.last_energy,
+    ):
+        # Not taken over (yet), or one as long as the one before.
+        anew = seen.session_time < running.session_time
+        told = running if anew or seen.session_energy < running.session_energy else seen
+        time, energy = told.session_time, told.session_energy
+    return ChargeEnded(port=port, result=seen.result, energy=energy, duration=time)
 
 
 def port_of(event: Event) -> int | None:

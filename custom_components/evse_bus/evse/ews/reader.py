@@ -16,18 +16,24 @@ from ..turns import Turns
 from .accepted import AcceptedLine
 from .config import ews_config
 from .events import (
-    ChargeEnded,
     ChargeStarted,
     Event,
     Listener,
-    StartRequested,
+    charge_ended,
     port_of,
+    start_requested,
 )
 from .frames import LONGEST_FRAME
 from .limiting import Limiter
 from .parameters import SystemMode
 from .permission import Permission
-from .readings import capabilities_of, charger_info, charger_reading, limits_of
+from .readings import (
+    RUNNING,
+    capabilities_of,
+    charger_info,
+    charger_reading,
+    limits_of,
+)
 from .session import EwsBox
 from .status import PortStatus, StartRelease
 from .timing import COMMAND_MARGIN, COMMAND_TIMEOUT, TIMING
@@ -55,6 +61,8 @@ class EwsReader(Charger):
         self._conversations: set[object] = set()
         self._assert_after = -inf
         self._charges = False
+        self._running: PortStatus | None = None
+        """How the port was when a charge was last seen under way."""
         self._not_understood = 0
         self._restarts = 0
 
@@ -297,16 +305,18 @@ class EwsReader(Charger):
     def _tell_events(self, before: PortStatus | None, seen: PortStatus) -> None:
         was_on = self._charges
         is_on = self._charges = self.permission.is_session(seen, was=was_on)
+        if seen.status in RUNNING:
+            self._running = seen
         events = self.box.events
         asked = StartRelease.REQUESTED
         if seen.start is asked and (before is None or before.start is not asked):
-            events.tell(StartRequested(port=self.port))
+            events.tell(start_requested(self.port, seen))
         if before is None:
             return
         if is_on and not was_on:
             events.tell(ChargeStarted(port=self.port))
         elif was_on and not is_on:
-            events.tell(ChargeEnded(port=self.port, result=seen.result))
+            events.tell(charge_ended(self.port, self._running, seen))
 
     # -- Faults of our own finding ---------------------------------------------------------
 

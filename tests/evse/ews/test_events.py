@@ -1,0 +1,170 @@
+"""What an event tells of a charge, and of whom."""
+
+import asyncio
+from dataclasses import replace
+
+import pytest
+
+from custom_components.evse_bus.evse.ews.events import (
+    ChargeEnded,
+    ChargeStarted,
+    StartRequested,
+    charge_ended,
+    start_requested,
+)
+from custom_components.evse_bus.evse.ews.status import (
+    Card,
+    ChargeResult,
+    PortStatus,
+    decode_ports,
+)
+from custom_components.evse_bus.evse.model import Command, OrderChange
+from tests.virtual.ews_rfid import Card as VirtualCard
+from tests.virtual.ews_session import Session
+
+from .ether import EwsScene, play
+from .wire import PORTS
+
+ON = OrderChange(allowed=True)
+OFF = OrderChange(allowed=False)
+IDLE = decode_ports(PORTS)[1]
+
+
+def port(session: tuple[int, int], last: tuple[int, int]) -> PortStatus:
+    """Return how a port is, with seconds and Wh of this charge and the last one."""
+    return replace(
+        IDLE,
+        session_time=session[0],
+        session_energy=session[1],
+        last_time=last[0],
+        last_energy=last[1],
+        result_code=1,
+    )
+
+
+@pytest.mark.parametrize(
+    ("running", "seen"),
+    [
+        # Taken over; the counters stay, or begin anew.
+        (port((90, 900), (5, 50)), port((100, 1000), (100, 1000))),
+        (port((90, 900), (5, 50)), port((0, 0), (100, 1000))),
+        # Taken over with a pause before, and nothing new since.
+        (port((90, 900), (60, 600)), port((0, 0), (100, 1000))),
+        # Taken over later only.
+        (port((90, 900), (5, 50)), port((100, 1000), (5, 50))),
+        (port((100, 1000), (5, 50)), port((0, 0), (5, 50))),
+        # As long as the one before.
+        (port((100, 1000), (100, 1000)), port((0, 0), (100, 1000))),
+        # Never seen under way.
+        (None, port((0, 0), (100, 1000))),
+    ],
+)
+def test_what_has_been_charged(running: PortStatus | None, seen: PortStatus) -> None:
+    ended = charge_ended(2, running, seen)
+    assert ended == ChargeEnded(
+        port=2, result=ChargeResult.STOPPED, energy=1000, duration=100
+    )
+
+
+def test_who_asks_for_a_start() -> None:
+    card = Card(group=7, number=42, user="MAXMUSTR")
+    asked = start_requested(1, replace(IDLE, card=card, optimised=True))
+    assert (asked.group, asked.number, asked.optimised) == (7, 42, True)
+    assert repr(asked) == "StartRequested(port=1, optimised=True)"
+    nobody = start_requested(2, replace(IDLE, card=None))
+    assert nobody == StartRequested(port=2, optimised=False)
+
+
+# -- On the virtual box --------------------------------------------------------------
+
+
+def ends(scene: EwsScene) -> list[ChargeEnded]:
+    return [one for one in scene.events if isinstance(one, ChargeEnded)]
+
+
+class Late(Session):
+    """Takes a charge over when the car has gone, and then begins anew."""
+
+    def end(self, result: int, at: tuple[int, ...]) -> None:
+        self.result, self.last_end = result, at
+
+    def gone(self) -> None:
+        if self.seconds:
+            self.last_seconds, self.last_wh = self.seconds, self.wh
+        super().gone()
+
+
+class AtOnce(Session):
+    """Takes a charge over at its end, and begins anew at once."""
+
+    def end(self, result: int, at: tuple[int, ...]) -> None:
+        super().end(result, at)
+        self.seconds = self.wh = 0.0
+
+
+@pytest.mark.parametrize("kind", [Session, Late, AtOnce])
+@pytest.mark.parametrize("how", ["stop", "leave", "pause and unlock", "rcd"])
+def test_the_end_of_a_charge(kind: type[Session], how: str) -> None:
+    """Whenever the box takes it over: also the second one, shorter than the first."""
+
+    async def acts(scene: EwsScene) -> None:
+        box = scene.box.ports[0]
+        box.session = kind()
+        for seconds in (120, 40):
+            before = box.session.total_wh
+            await scene.charge()
+            await asyncio.sleep(seconds)
+            if how == "stop":
+                await scene.charger().command(Command.STOP_AND_UNLOCK)
+            elif how == "leave":
+                scene.cars[0].leave()
+            elif how == "rcd":
+                scene.box.trip_rcd(1)
+                await asyncio.sleep(10)
+                scene.box.trip_rcd(1, tripped=False)
+            else:
+                await scene.charger().change_orders(OFF)
+                await asyncio.sleep(10)
+                await scene.charger().command(Command.UNLOCK)
+            await asyncio.sleep(5)
+            scene.cars[0].leave()
+            await scene.until(lambda: scene.status() == 0x00)
+            await asyncio.sleep(5)
+            charged = box.session.total_wh - before
+            ended = ends(scene)[-1]
+            assert ended.energy == pytest.approx(charged, rel=0.08)
+            assert ended.duration == pytest.approx(seconds + 3, abs=3)
+        assert len(ends(scene)) == 2
+        assert scene.events.count(ChargeStarted(port=1)) == 2
+
+    play(EwsScene(), acts)
+
+
+def test_a_charge_with_a_pause_is_one() -> None:
+    async def acts(scene: EwsScene) -> None:
+        await scene.charge()
+        await asyncio.sleep(60)
+        await scene.charger().change_orders(OFF)
+        await asyncio.sleep(60)
+        await scene.charger().change_orders(ON)
+        await asyncio.sleep(60)
+        await scene.charger().command(Command.STOP_AND_UNLOCK)
+        await asyncio.sleep(5)
+        (ended,) = ends(scene)
+        assert ended.energy == pytest.approx(scene.box.ports[0].session.total_wh, abs=2)
+        assert ended.duration == pytest.approx(123, abs=3)
+
+    play(EwsScene(), acts)
+
+
+def test_a_start_that_is_asked_for_with_a_card() -> None:
+    async def acts(scene: EwsScene) -> None:
+        scene.box.present_card(VirtualCard(7, 42, "MAX"))
+        await scene.plug(2)
+        await scene.charger(2).command(Command.SET_OPTIMISED, value=True)
+        scene.box.press_key(2, 1)
+        await scene.until(lambda: scene.connector(2).start_requested)
+        (asked,) = (one for one in scene.events if isinstance(one, StartRequested))
+        assert asked == StartRequested(port=2, optimised=True, group=7, number=42)
+
+    play(EwsScene(options={"rfid": True}), acts)
