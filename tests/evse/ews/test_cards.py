@@ -58,7 +58,10 @@ def test_a_list_is_written_as_it_was_read(data: bytes) -> None:
 
 @given(
     st.binary(min_size=256, max_size=256),
-    st.dictionaries(st.integers(0, 63), st.integers(0, 0xFFFFFFFF), max_size=5),
+    # Kinds that say something of somebody else each: twice the same is refused.
+    st.dictionaries(
+        st.integers(0, 63), st.sampled_from(range(0x40000000, 1 << 32)), min_size=1
+    ),
 )
 def test_only_the_entries_that_are_named_are_changed(
     data: bytes, changes: dict[int, int]
@@ -70,6 +73,43 @@ def test_only_the_entries_that_are_named_are_changed(
     for at in range(64):
         wanted = changes[at].to_bytes(4) if at in changes else data[4 * at : 4 * at + 4]
         assert after[4 * at : 4 * at + 4] == wanted
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {64: card_entry(EntryKind.FREE)},
+        {-1: card_entry(EntryKind.FREE)},
+        # Twice in what is new, or once there already; also where they disagree.
+        {8: card_entry(EntryKind.GROUP, 9), 9: card_entry(EntryKind.GROUP, 9)},
+        {8: card_entry(EntryKind.GROUP, 7)},
+        {8: card_entry(EntryKind.CARD, 7, 42)},
+        {8: card_entry(EntryKind.BLOCKED, 7, 42)},
+        {0: card_entry(EntryKind.CARD, 7, 43)},
+    ],
+)
+def test_changes_that_make_no_sense(changes: dict[int, CardEntry]) -> None:
+    with pytest.raises(RefusedOrderError) as told:
+        decode_cards(LIST).with_entries(changes)
+    assert not any(number in str(told.value) for number in ("42", "43"))
+
+
+def test_changes_that_make_sense() -> None:
+    cards = decode_cards(LIST)
+    moved = cards.with_entries(
+        {1: card_entry(EntryKind.FREE), 8: card_entry(EntryKind.CARD, 7, 42)}
+    )
+    assert moved.entries[8] == cards.entries[1]
+    # Blocked instead of allowed, in its own place; a card beside its group.
+    moved.with_entries({8: card_entry(EntryKind.BLOCKED, 7, 42)})
+    cards.with_entries({9: card_entry(EntryKind.CARD, 7, 1)})
+    # What stands there twice keeps nobody from another entry.
+    twice = decode_cards(LIST[:16] + LIST[:16] + LIST[32:])
+    assert (
+        twice.with_entries({9: card_entry(EntryKind.CARD, 7, 1)}).entries[4:8]
+        == (twice.entries[:4])
+    )
 
 
 def test_entries_as_sf_has_them() -> None:

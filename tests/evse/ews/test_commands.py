@@ -253,6 +253,9 @@ def test_mc_that_does_not_fit() -> None:
     for timeout in (-1, 256):
         with pytest.raises(RefusedOrderError):
             card_reader(ReaderTarget.CARD, timeout, b"")
+    for target in (0, 3, 256):
+        with pytest.raises(RefusedOrderError):
+            card_reader(target, 1, b"")  # type: ignore[arg-type]
 
 
 # -- oe, ow, fw ----------------------------------------------------------------------

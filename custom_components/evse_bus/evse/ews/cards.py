@@ -87,14 +87,26 @@ class CardList:
     def with_entries(self, changes: Mapping[int, CardEntry]) -> CardList:
         """Return the list with some entries (0 to 63) replaced, and nothing else.
 
-        Raises RefusedOrderError for an entry that there is not.
+        Raises RefusedOrderError for nothing to replace, for an entry that there is
+        not, and for a new one about whom another entry says something already.
         """
+        if not changes:
+            raise RefusedOrderError("no entry of the list is to be replaced")
         if not changes.keys() <= set(range(len(self.entries))):
             message = f"the list has entries 0 to {len(self.entries) - 1}"
             raise RefusedOrderError(message)
-        return CardList(
-            tuple(changes.get(at, entry) for at, entry in enumerate(self.entries))
-        )
+        after = tuple(changes.get(at, entry) for at, entry in enumerate(self.entries))
+        about: dict[tuple[bool, int, int], int] = {}
+        for at, entry in enumerate(after):
+            if entry.kind in (None, EntryKind.FREE):
+                continue
+            key = (entry.kind is EntryKind.GROUP, entry.group, entry.card)
+            other = about.setdefault(key, at)
+            # What stands there twice already is nobody's mistake of now.
+            if other != at and {at, other} & changes.keys():
+                message = f"entries {other} and {at} are about the same card or group"
+                raise RefusedOrderError(message)
+        return CardList(after)
 
 
 _ENTRY: Final = Struct(CardEntry, "3.2.4 sf: entry", (Number(name="raw", width=4),))

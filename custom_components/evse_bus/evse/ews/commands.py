@@ -243,6 +243,9 @@ def card_reader(target: ReaderTarget, timeout: int, data: bytes) -> Request:
 
     ``timeout``: of the reader, s. Raises RefusedOrderError for what does not fit.
     """
+    if target not in ReaderTarget:
+        message = f"{target} is neither the reader nor the card"
+        raise RefusedOrderError(message)
     if len(data) > MAXIMUM_PARAMETERS - _READER_HEAD:
         message = f"{len(data)} bytes for the card reader do not fit"
         raise RefusedOrderError(message)
