@@ -23,6 +23,13 @@ CARD_PIN = "Px7q"
 USER_PASSWORD = "alsosecret"  # noqa: S105 - the virtual box's
 
 
+WRITERS = {
+    "system": "write_system_parameters",
+    "network": "write_network_parameters",
+    "installation": "write_installation_info",
+    "extra": "write_extra_parameters",
+}
+"""The action that writes each block of parameters."""
 WRITES = ("cr", "ma", "se", "sf", "sp", "su", "si", "sz")
 """Commands by which actions change something at the box."""
 

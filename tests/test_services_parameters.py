@@ -15,14 +15,7 @@ from tests.virtual import Car
 from tests.virtual.ews_box import EwsBox
 from tests.virtual.ews_parameters import SystemMode
 
-from .services import ADMIN_PASSWORD, CARD_PIN, USER_PASSWORD, scene
-
-WRITERS = {
-    "system": "write_system_parameters",
-    "network": "write_network_parameters",
-    "installation": "write_installation_info",
-    "extra": "write_extra_parameters",
-}
+from .services import ADMIN_PASSWORD, CARD_PIN, USER_PASSWORD, WRITERS, scene
 
 # -- Reading ---------------------------------------------------------------------
 

@@ -1,5 +1,6 @@
 """What the forms of the actions offer, name and take is one thing."""
 
+from collections.abc import Callable
 import json
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from hypothesis import given, strategies as st
 import pytest
 from pytest_homeassistant_custom_component.common import MockConfigEntry
 
-from custom_components.evse_bus import actions_cards, actions_leds
+from custom_components.evse_bus import actions_cards, actions_fields, actions_leds
 from custom_components.evse_bus.actions_parameters import (
     BLOCKS,
     LOCK_TYPES,
@@ -23,9 +24,12 @@ from custom_components.evse_bus.const import DOMAIN
 from custom_components.evse_bus.errors import EWS_KEYS, ActionError
 from custom_components.evse_bus.evse.errors import RefusedOrderError
 from custom_components.evse_bus.evse.ews.answers import Refusal
+from custom_components.evse_bus.evse.ews.cards import ENTRIES, LARGEST
 from custom_components.evse_bus.evse.ews.commands import PortLeds, set_leds
 from custom_components.evse_bus.services import ACTIONS
 from tests.flow import english
+
+from .services import WRITERS
 
 HERE = Path(__file__).parents[1] / "custom_components/evse_bus"
 ICONS = json.loads((HERE / "icons.json").read_text())["services"]
@@ -112,6 +116,45 @@ def test_choices_are_those_that_are_taken_and_have_texts() -> None:
         assert english()["selector"][key]["options"].keys() == set(options[key])
     texts = english()["selector"][entry["translation_key"]]["fields"]
     assert texts.keys() == entry["fields"].keys()
+
+
+def number_fields(name: str) -> list[tuple[str, dict[str, Any]]]:
+    """Return the fields of an action that are numbers, with their bounds."""
+    return [
+        (key, field["selector"]["number"])
+        for key, field in fields_of(name).items()
+        if "number" in field["selector"]
+    ]
+
+
+def test_the_form_has_the_bounds_of_what_is_taken(subtests: pytest.Subtests) -> None:
+    take: dict[str, Callable[[dict[str, object]], object]] = {
+        "set_leds": lambda data: actions_leds.port_leds(
+            {next(iter(data)).split("_")[0]: "blink", **data}
+        ),
+        "set_meter_total": lambda data: actions_fields.meter_total("", data["total"]),
+        **{WRITERS[block]: BLOCKS[block].changes for block in BLOCKS},
+    }
+    for name, action in take.items():
+        for key, bounds in number_fields(name):
+            step = bounds.get("step", 1)
+            with subtests.test(key=key):
+                action({key: bounds["min"]})
+                action({key: bounds["max"]})
+                for wrong in (bounds["min"] - step, bounds["max"] + step):
+                    with pytest.raises(ServiceValidationError):
+                        action({key: wrong})
+
+
+def test_the_form_has_the_bounds_of_cards() -> None:
+    for key, bounds in number_fields("accept_card"):
+        assert (bounds["min"], bounds["max"]) == (1, LARGEST), key
+    entry = fields_of("write_card_list")["entries"]["selector"]["object"]["fields"]
+    assert {
+        key: field["selector"]["number"]["max"]
+        for key, field in entry.items()
+        if key != "kind"
+    } == {"entry": ENTRIES - 1, "group": LARGEST, "number": LARGEST}
 
 
 async def test_home_assistant_takes_the_descriptions(hass: HomeAssistant) -> None:

@@ -115,7 +115,7 @@ ACTIONS: Final[Mapping[str, Action]] = {
 
 @callback
 def async_register(hass: HomeAssistant) -> None:
-    """Register the actions: once, also while no bus is set up."""
+    """Register the actions: once, whatever becomes of the buses."""
     for name, action in ACTIONS.items():
         register = (
             partial(async_register_admin_service, hass)
@@ -167,12 +167,11 @@ def _target(
         for unit in coordinator.units.values()
         if {unit.key, unit.subentry_id} & keys and isinstance(unit.charger, EwsPort)
     ]
-    chosen = [one for one in ports if one[0].key in keys] or ports
-    if not chosen:
+    if not ports:
         raise wrong_action(ActionError.NOT_EWS_BOX, device=_name(device))
-    if of_port and len(chosen) > 1:
+    if of_port and len(ports) > 1:
         raise wrong_action(ActionError.CHOOSE_PORT, device=_name(device))
-    unit, charger = min(chosen, key=lambda one: one[1].port)
+    unit, charger = min(ports, key=lambda one: one[1].port)
     return coordinator, unit, charger
 
 
