@@ -157,6 +157,35 @@ def test_a_charge_with_a_pause_is_one() -> None:
     play(EwsScene(), acts)
 
 
+def test_an_end_that_nobody_has_seen_is_told_later() -> None:
+    """The line is lost meanwhile; what was under way before our time is no start."""
+
+    async def acts(scene: EwsScene) -> None:
+        await scene.charge()
+        await asyncio.sleep(60)
+        scene.line.unplug()
+        scene.cars[0].leave()
+        await scene.until(lambda: scene.status() == 0x00)
+        await scene.until(lambda: scene.charger().reading is not None)
+        await asyncio.sleep(10)
+        (ended,) = ends(scene)
+        assert ended.energy == pytest.approx(scene.box.ports[0].session.total_wh, abs=2)
+        assert ended.result is ChargeResult.PILOT_LOST
+        scene.line.unplug()
+        scene.cars[0].plug_in()
+        await scene.until(lambda: scene.status() == 0x30)
+        scene.box.ports[0].release_start("somebody")
+        await scene.until(lambda: scene.charger().reading is not None)
+        await asyncio.sleep(10)
+        assert scene.connector().charging
+        scene.line.unplug()
+        await asyncio.sleep(10)
+        assert scene.events.count(ChargeStarted(port=1)) == 1
+        assert len(ends(scene)) == 1
+
+    play(EwsScene(), acts)
+
+
 def test_a_start_that_is_asked_for_with_a_card() -> None:
     async def acts(scene: EwsScene) -> None:
         scene.box.present_card(VirtualCard(7, 42, "MAX"))

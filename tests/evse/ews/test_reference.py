@@ -26,8 +26,9 @@ def test_every_command_has_its_row() -> None:
 @pytest.mark.parametrize("name", ROWS)
 def test_a_row_names_what_there_is(name: str) -> None:
     *_, code, test = ROWS[name]
-    module, what = code.strip("`").split(".")
-    assert hasattr(import_module(f"{LIBRARY}.{module}"), what)
+    for one in code.split(", "):
+        module, what = one.strip("`").split(".")
+        assert hasattr(import_module(f"{LIBRARY}.{module}"), what)
     module, what = test.strip("`").split(".")
     assert hasattr(import_module(f"tests.evse.ews.{module}"), what)
 
@@ -37,4 +38,6 @@ def test_every_state_and_every_order_is_told() -> None:
         assert f"0x{code:02X}" in PAGE or code in range(0x40, 0x44)
     orders = PAGE.split("## What may be ordered when")[1].split("\n## ")[0]
     told = re.findall(r"^\| ([1-7])(?:, ([1-7]))?", orders, re.MULTILINE)
-    assert [int(one) for pair in told for one in pair if one] == [*RULES]
+    # Order 6 has two rows: it does two things.
+    numbers = dict.fromkeys(int(one) for pair in told for one in pair if one)
+    assert [*numbers] == [*RULES]

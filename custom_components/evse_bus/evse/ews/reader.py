@@ -311,12 +311,11 @@ class EwsReader(Charger):
         asked = StartRelease.REQUESTED
         if seen.start is asked and (before is None or before.start is not asked):
             events.tell(start_requested(self.port, seen))
-        if before is None:
-            return
-        if is_on and not was_on:
-            events.tell(ChargeStarted(port=self.port))
-        elif was_on and not is_on:
+        if was_on and not is_on:
             events.tell(charge_ended(self.port, self._running, seen))
+        elif is_on and not was_on and before is not None:
+            # Else it may have begun before our time.
+            events.tell(ChargeStarted(port=self.port))
 
     # -- Faults of our own finding ---------------------------------------------------------
 
