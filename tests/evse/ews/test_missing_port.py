@@ -38,8 +38,10 @@ def test_it_is_told_and_gets_no_word() -> None:
                     await missing.change_orders(change)
             with pytest.raises(NotAvailableError, match="no port 2"):
                 await missing.command(Command.STOP_AND_UNLOCK)
+            with pytest.raises(NotAvailableError, match="no port 2"):
+                await missing.services.set_meter(5)
             assert not scene.line.limits(2)
-            assert not scene.line.orders()
+            assert not scene.line.named("sl", "cr")
             # The other one knows nothing of it.
             assert not scene.charger().faults
             await scene.charge()

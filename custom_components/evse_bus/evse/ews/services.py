@@ -115,12 +115,19 @@ class Services:
     # -- Meter, LEDs, clock, network -------------------------------------------------
 
     async def set_meter(self, total: int) -> None:
-        """Set the meter total of this port, Wh (``cr``)."""
-        request = set_meter(self._port.port, total)
-        await self.in_a_turn(
-            lambda talk: self._port.box.tell(talk, CommandId.SET_METER, lambda: request)
-        )
-        self._port.hurry()
+        """Set the meter total of this port, Wh (``cr``).
+
+        Raises NotAvailableError for a port that the box does not have.
+        """
+        port = self._port
+        request = set_meter(port.port, total)
+
+        async def write(talk: Talk) -> None:
+            await port.look(talk)
+            await port.box.tell(talk, CommandId.SET_METER, lambda: request)
+
+        await self.in_a_turn(write)
+        port.hurry()
 
     async def set_leds(self, first: PortLeds, second: PortLeds) -> None:
         """Set the LEDs of both ports; only a box with manual keys and LEDs (``se``)."""
