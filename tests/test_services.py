@@ -316,6 +316,22 @@ async def test_a_card_list_that_cannot_be(
         assert not here.written("sf")
 
 
+async def test_a_card_stands_in_the_list_once(hass: HomeAssistant) -> None:
+    box = EwsBox()
+    box.cards.add(3, 7, 42)
+    async with scene(hass, box) as here:
+        # In the box, and in what is to be written.
+        await here.refuses("write_card_list", "card_twice", entries=[ENTRY])
+        await here.refuses(
+            "write_card_list",
+            "card_twice",
+            entries=[{"entry": at, "kind": "group", "group": 8} for at in (4, 5)],
+        )
+        assert not here.written("sf")
+        await here.act("write_card_list", entries=[{"entry": 0, "kind": "free"}, ENTRY])
+        assert box.cards.entries[:2] == [0, 2 << 28 | 7 << 14 | 42]
+
+
 async def test_a_single_entry_needs_no_list(hass: HomeAssistant) -> None:
     async with scene(hass) as here:
         await here.act("write_card_list", entries=ENTRY)

@@ -74,7 +74,12 @@ def _show(at: int, entry: CardEntry) -> JsonObjectType:
 
 async def write_card_list(port: EwsPort, given: Mapping[str, object]) -> None:
     """Replace some entries of the box's own list; the others stay as they are."""
-    await port.services.write_cards(_entries(given[CONF_ENTRIES]))
+    changes = _entries(given[CONF_ENTRIES])
+    try:
+        await port.services.write_cards(changes)
+    except RefusedOrderError as error:
+        # Each entry is right by itself: it is about whom another one is.
+        raise wrong_action(ActionError.CARD_TWICE) from error
 
 
 def _entries(given: object) -> dict[int, CardEntry]:

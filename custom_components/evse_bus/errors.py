@@ -79,6 +79,7 @@ class ActionError(StrEnum):
     CARDS_NOT_TAKEN = "cards_not_taken"
     CARD_ENTRIES = "card_entries"
     CARD_ENTRY_TWICE = "card_entry_twice"
+    CARD_TWICE = "card_twice"
     CARD_ENTRY_NUMBERS = "card_entry_numbers"
     LED_TIMES = "led_times"
     FIELD_NUMBER = "field_number"
