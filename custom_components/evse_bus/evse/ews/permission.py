@@ -74,7 +74,7 @@ class Permission:
         self._time = 0
 
     def forget(self) -> None:
-        """Note that the box was restarted: it knows of no pause."""
+        """Note that no pause of ours stands any more: restarted, stopped or unlocked."""
         self.paused = False
         self.waits_for_current = False
 
