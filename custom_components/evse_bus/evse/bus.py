@@ -7,7 +7,6 @@ this module has the turns: retries, presence, reopening of a lost port.
 import asyncio
 from collections.abc import Callable
 from contextlib import suppress
-from functools import partial
 import logging
 from math import inf
 from typing import Final, Self
@@ -27,7 +26,7 @@ from .exchange import Talk, Wire
 from .framing import Frame, Framer, Timing
 from .jobs import Job, JobQueue, Later, Step
 from .line import Line
-from .listeners import tell
+from .listeners import Observed
 from .model import OrderChange, Persistence
 from .schedule import Kind, Slot, choose
 from .serving import serve
@@ -42,7 +41,7 @@ STOP_PATIENCE: Final = 6.0
 """Longest time a stop waits for a conversation begun (waking a car: 3 s), s."""
 
 
-class Bus:
+class Bus(Observed):
     """All chargers of one line, and the line."""
 
     def __init__(
@@ -54,7 +53,11 @@ class Bus:
         *,
         duty: Duty | None = None,
     ) -> None:
-        """Put chargers on with `add`, then `start`."""
+        """Put chargers on with `add`, then `start`.
+
+        Listeners are told when the port is lost or back.
+        """
+        super().__init__()
         self.line = line
         self.name = name or line.url
         self.wire = Wire(line, framer, timing)
@@ -72,7 +75,6 @@ class Bus:
         self._turn_of: Slot | None = None
         self._turn_over = asyncio.Event()
         self._last_probe = -inf
-        self._listeners: list[Callable[[], None]] = []
         line.on_lost = self._on_lost
         self.duty = duty
         if duty is not None:
@@ -163,11 +165,6 @@ class Bus:
                 and (begun or not job.begun)
             ):
                 self._jobs.fail(job, gone)
-
-    def subscribe(self, listener: Callable[[], None]) -> Callable[[], None]:
-        """Call back when the port is lost or back; return how to stop."""
-        self._listeners.append(listener)
-        return partial(self._listeners.remove, listener)
 
     # -- Commands ----------------------------------------------------------------
 
@@ -399,7 +396,7 @@ class Bus:
             charger.slot.ready = now + charger.minimum_pause(now)
         if self.duty is not None:
             self.duty.on_line_open(now)
-        tell(self._listeners)
+        self.updated()
 
     def _on_lost(self, error: LineLostError) -> None:
         _LOGGER.warning("%s: the port was lost (%s), trying again", self.name, error)
@@ -409,7 +406,7 @@ class Bus:
         if self.duty is not None:
             self.duty.slot.start_by = inf
         self._abandon_chargers()
-        tell(self._listeners)
+        self.updated()
         self.look_again()
 
     def hush(self, why: str) -> None:

@@ -16,13 +16,13 @@ from collections.abc import Awaitable, Callable, Mapping
 from functools import partial
 import logging
 from math import inf
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, override
 
 from .errors import NotAvailableError
 from .exchange import Talk
 from .framing import Frame, Timing
 from .jobs import Job, Later, Step, merge_key
-from .listeners import tell
+from .listeners import Observed
 from .model import (
     Capability,
     ChargerConfig,
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 _LOGGER = logging.getLogger(__name__)
 
 
-class Charger(ABC):
+class Charger(Observed, ABC):
     """One charger on a bus."""
 
     timing: ClassVar[Timing]
@@ -57,6 +57,7 @@ class Charger(ABC):
 
     def __init__(self, config: ChargerConfig, orders: Orders) -> None:
         """Take the orders that stand; nothing is sent before the bus starts."""
+        super().__init__()
         self.config = config
         self.orders = orders
         self._wish = orders
@@ -79,7 +80,6 @@ class Charger(ABC):
         self.bus: Bus | None = None
         self._renewed: float | None = None
         self._clamped: tuple[tuple[Orders, Limits], Setpoint] | None = None
-        self._listeners: list[Callable[[], None]] = []
 
     # -- What it is and has ------------------------------------------------------
 
@@ -181,9 +181,7 @@ class Charger(ABC):
         """Return an urgent turn for a frame nobody asked for; ``None``: not mine."""
         return None
 
-    async def farewell(  # noqa: B027 - most have nothing to say
-        self, *, for_good: bool = False
-    ) -> None:
+    async def farewell(self, *, for_good: bool = False) -> None:
         """Say what is to be said when everything stops; orders stay as they are.
 
         ``for_good``: only this charger is taken off, for ever; the bus goes on.
@@ -413,15 +411,11 @@ class Charger(ABC):
 
     # -- Listeners ---------------------------------------------------------------
 
-    def subscribe(self, listener: Callable[[], None]) -> Callable[[], None]:
-        """Call back after each change of what is known; return how to stop."""
-        self._listeners.append(listener)
-        return partial(self._listeners.remove, listener)
-
+    @override
     def updated(self) -> None:
         """Tell the listeners."""
         self.last_told = self.told
-        tell(self._listeners)
+        super().updated()
 
     async def wait_available(self, patience: float = 60.0) -> ChargerReading:
         """Return the first reading, as soon as there is one.

@@ -6,11 +6,9 @@ may impose silence on everybody.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from functools import partial
 from typing import TYPE_CHECKING
 
-from .listeners import tell
+from .listeners import Observed
 from .schedule import Kind, Slot
 from .statistics import ChargerStatistics
 
@@ -21,17 +19,17 @@ if TYPE_CHECKING:
     from .model import Fault, Supply
 
 
-class Duty(ABC):
+class Duty(Observed, ABC):
     """A recurring turn of the bus itself."""
 
     def __init__(self) -> None:
         """Nothing is said before the bus starts."""
+        super().__init__()
         self.slot = Slot(kind=Kind.PAUSE)
         self.statistics = ChargerStatistics()
         self.bus: Bus | None = None
         self.noticed: frozenset[Fault] = frozenset()
         """Faults of the whole bus."""
-        self._listeners: list[Callable[[], None]] = []
 
     @property
     @abstractmethod
@@ -59,20 +57,11 @@ class Duty(ABC):
         """Look at a frame that nobody asked for; return whether it was for us."""
         return False
 
-    async def change_supply(self, supply: Supply) -> None:  # noqa: B027 - not all share
+    async def change_supply(self, supply: Supply) -> None:
         """Share this much among all chargers from now on; return when they heard.
 
         Raises RefusedOrderError for a supply that cannot be.
         """
-
-    def subscribe(self, listener: Callable[[], None]) -> Callable[[], None]:
-        """Call back after each change of what is known; return how to stop."""
-        self._listeners.append(listener)
-        return partial(self._listeners.remove, listener)
-
-    def updated(self) -> None:
-        """Tell the listeners."""
-        tell(self._listeners)
 
     def notice(self, fault: Fault, *, present: bool) -> None:
         """Set or clear a fault of the whole bus, and tell."""
