@@ -41,14 +41,18 @@ SAME_EVERYWHERE = {
     *("1", "2"),
     # Words of a SmartEVSE's menu.
     *("Normal", "Smart", "Solar"),
+    # A maker of plug locks.
+    "Walther",
+    # The name that a box gives.
+    "{name}",
 }
 SAME = {
     # The language has the same word.
     "de": {"Name", "Port", "Slave", "Slaves", "Status"},
     "fr": {"Message", "Module {number}", "Port"},
     "nl": {
-        *("Even", "Module {number}", "Protocol", "Slave", "Slaves", "Status"),
-        "Time-outs",
+        *("Even", "Gateway", "Module {number}", "Parameters", "Protocol"),
+        *("Server", "Slave", "Slaves", "Status", "Time-outs"),
     },
 }
 
@@ -165,7 +169,7 @@ def test_french_signs_do_not_stand_alone() -> None:
     "category",
     [
         *("config", "config_subentries", "device", "entity"),
-        *("exceptions", "issues", "selector"),
+        *("exceptions", "issues", "options", "selector", "services"),
     ],
 )
 async def test_home_assistant_takes_them(
