@@ -197,3 +197,27 @@ def test_a_start_that_is_asked_for_with_a_card() -> None:
         assert asked == StartRequested(port=2, optimised=True, group=7, number=42)
 
     play(EwsScene(options={"rfid": True}), acts)
+
+
+def test_a_start_that_is_asked_for_before_the_car_is_found() -> None:
+    """Told when a yes counts: said earlier, it would start nobody."""
+
+    async def acts(scene: EwsScene) -> None:
+        port = scene.box.ports[0]
+        port.search_time = 10.0
+        await scene.until(lambda: scene.charger().reading is not None)
+        scene.cars[0].plug_in()
+        await scene.until(lambda: scene.connector().raw_state == "0x10")
+        scene.box.press_key(1, 1)
+        await asyncio.sleep(3)
+        assert port.start_mode == 1
+        assert scene.connector().start_requested is False
+        assert not [one for one in scene.events if isinstance(one, StartRequested)]
+        await scene.until(lambda: scene.connector().start_requested)
+        assert scene.status() == 0x30
+        told = [one for one in scene.events if isinstance(one, StartRequested)]
+        assert told == [StartRequested(port=1, optimised=False)]
+        await scene.charger().change_orders(ON)
+        await scene.until(lambda: scene.status() == 0x40)
+
+    play(EwsScene(), acts)

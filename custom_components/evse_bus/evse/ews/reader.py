@@ -29,13 +29,14 @@ from .parameters import SystemMode
 from .permission import Permission
 from .readings import (
     RUNNING,
+    asks_for_start,
     capabilities_of,
     charger_info,
     charger_reading,
     limits_of,
 )
 from .session import EwsBox
-from .status import PortStatus, StartRelease
+from .status import PortStatus
 from .timing import COMMAND_MARGIN, COMMAND_TIMEOUT, TIMING
 
 _SOONER: Final = 1.0
@@ -308,8 +309,8 @@ class EwsReader(Charger):
         if seen.status in RUNNING:
             self._running = seen
         events = self.box.events
-        asked = StartRelease.REQUESTED
-        if seen.start is asked and (before is None or before.start is not asked):
+        asked = before is not None and asks_for_start(before)
+        if asks_for_start(seen) and not asked:
             events.tell(start_requested(self.port, seen))
         if was_on and not is_on:
             events.tell(charge_ended(self.port, self._running, seen))

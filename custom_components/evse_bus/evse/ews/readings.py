@@ -139,7 +139,7 @@ def charger_reading(port: int, box: Told, *, paused: bool) -> ChargerReading:
         locked=state.locked,
         contactor=seen.contactor,
         optimised=seen.optimised,
-        start_requested=seen.start is StartRelease.REQUESTED,
+        start_requested=asks_for_start(seen),
         rcd_tripped=seen.rcd_tripped,
         ventilation_requested=PortFlags.VENTILATION in seen.flags,
         pilot_low=seen.pwm_minimum,
@@ -166,6 +166,15 @@ def charger_reading(port: int, box: Told, *, paused: bool) -> ChargerReading:
             "meter_cycles": seen.meter_cycles,
         },
     )
+
+
+def asks_for_start(seen: PortStatus) -> bool:
+    """Return whether somebody waits for our permission.
+
+    A start may be asked for while the box still looks for the car. A permission would
+    start nobody then, and be forgotten: so the car that waits is what asks.
+    """
+    return seen.start is StartRelease.REQUESTED and seen.status == WAITING
 
 
 def _result(told: ChargeResult | None) -> SessionResult | None:
