@@ -1,4 +1,4 @@
-"""The automations of the README, as they stand there."""
+"""The automations of the documentation, as they stand there."""
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -14,15 +14,18 @@ import pytest
 from pytest_homeassistant_custom_component.common import async_fire_time_changed
 
 from tests.common import call, get_entity, running, wait_for_state
-from tests.virtual import AblBox
+from tests.virtual import AblBox, Car, EwsBox, EwsCard, VirtualBus
 
-README = Path(__file__).parents[1] / "README.md"
+ROOT = Path(__file__).parents[1]
 
 
 @asynccontextmanager
-async def automated(hass: HomeAssistant, alias: str) -> AsyncIterator[None]:
-    """Run one of the README's automations."""
-    blocks = re.findall(r"```yaml\n(.*?)```", README.read_text(), re.DOTALL)
+async def automated(
+    hass: HomeAssistant, alias: str, page: str = "README.md"
+) -> AsyncIterator[None]:
+    """Run one of a page's automations."""
+    text = (ROOT / page).read_text()
+    blocks = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
     (wanted,) = (
         parsed
         for block in blocks
@@ -98,3 +101,76 @@ async def test_the_main_fuse_is_spared_by_a_charger_that_was_away(
             bus.add(box)
             await wait_for_state(hass, limit, "6.0")
             await bus.wait_for_async(lambda: box.ic_amps <= 6)
+
+
+# -- An EWS-Box asks before it charges ---------------------------------------------
+
+
+@asynccontextmanager
+async def yard(
+    hass: HomeAssistant, box: EwsBox, car: Car
+) -> AsyncIterator[tuple[VirtualBus, str]]:
+    """Run a box with a card reader, and a car that waits at its first port."""
+    async with running(hass, box) as (entry, bus):
+        allowed = await get_entity(hass, "switch", entry, "1_charging_allowed")
+        assert allowed == "switch.yard_port_1_charging_allowed"
+        status = await get_entity(hass, "sensor", entry, "1_status")
+        await get_entity(hass, "event", entry, "1_start_request")
+        await get_entity(hass, "event", entry, "card")
+        car.plug_in()
+        await wait_for_state(hass, status, "preparing")
+        yield bus, allowed
+
+
+async def test_a_start_request_of_a_known_card_is_answered(hass: HomeAssistant) -> None:
+    car = Car()
+    box = EwsBox(cars=(car, None), rfid=True)
+    async with (
+        yard(hass, box, car) as (bus, allowed),
+        automated(hass, "Answer a start request"),
+    ):
+        box.present_card(EwsCard(group=7, number=43))
+        await bus.wait_for_async(lambda: box.reader.valid)
+        assert not box.ports[0].contactor
+        box.press_key(1, 1)
+        await bus.wait_for_async(lambda: box.ports[0].contactor)
+        await wait_for_state(hass, allowed, "on")
+
+
+async def test_a_start_request_of_another_card_is_not(hass: HomeAssistant) -> None:
+    car = Car()
+    box = EwsBox(cars=(car, None), rfid=True)
+    requested = "binary_sensor.yard_port_1_start_requested"
+    async with yard(hass, box, car) as (bus, _allowed):
+        box.present_card(EwsCard(group=7, number=44))
+        async with automated(hass, "Answer a start request"):
+            box.press_key(1, 1)
+            await wait_for_state(hass, requested, "on")
+            await wait_for_state(hass, requested, "off")
+        await bus.wait_for_async(lambda: box.ports[0].start_mode == 0)
+        assert not box.ports[0].witness.starts
+        assert [one.parameters for one in box.commands_named("sl")] == [b"\x01\x01"]
+
+
+@pytest.mark.parametrize(
+    ("tag", "starts"), [("04a1b2c3d4e5f6", True), ("04a1b2c3d4e5f7", False)]
+)
+async def test_a_card_of_another_format_is_accepted(
+    hass: HomeAssistant, tag: str, *, starts: bool
+) -> None:
+    car = Car()
+    box = EwsBox(cars=(car, None), rfid=True)
+    card = EwsCard(tag=bytes.fromhex(tag), foreign=True)
+    async with (
+        yard(hass, box, car) as (bus, _allowed),
+        automated(hass, "Accept a card of another format", "docs/ews.md"),
+    ):
+        box.present_card(card)
+        await wait_for_state(hass, "event.yard_card", lambda state: state.state)
+        await hass.async_block_till_done()
+        assert len(box.commands_named("ma")) == starts
+        box.press_key(1, 1)
+        if starts:
+            await bus.wait_for_async(lambda: box.ports[0].contactor)
+        else:
+            assert not box.ports[0].witness.starts

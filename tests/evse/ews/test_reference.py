@@ -9,12 +9,12 @@ import pytest
 from custom_components.evse_bus.evse.ews.frames import CommandId
 from custom_components.evse_bus.evse.ews.states import RULES, STATES
 
-PAGE = (Path(__file__).parents[3] / "docs/ews.md").read_text()
+PAGE = (Path(__file__).parents[3] / "docs/ews-protocol.md").read_text()
 ROWS = {
     cells[0].strip("`"): cells
     for line in PAGE.splitlines()
     if line.startswith("| `")
-    and len(cells := [cell.strip() for cell in line.strip("|").split("|")]) == 7
+    and len(cells := [cell.strip() for cell in line.strip("|").split("|")]) == 8
 }
 LIBRARY = "custom_components.evse_bus.evse.ews"
 
@@ -25,12 +25,14 @@ def test_every_command_has_its_row() -> None:
 
 @pytest.mark.parametrize("name", ROWS)
 def test_a_row_names_what_there_is(name: str) -> None:
-    *_, code, test = ROWS[name]
+    *_, code, test, where = ROWS[name]
     for one in code.split(", "):
         module, what = one.strip("`").split(".")
         assert hasattr(import_module(f"{LIBRARY}.{module}"), what)
     module, what = test.strip("`").split(".")
     assert hasattr(import_module(f"tests.evse.ews.{module}"), what)
+    # What it says is looked up where Home Assistant is known: tests/test_docs.py.
+    assert where
 
 
 def test_every_state_and_every_order_is_told() -> None:

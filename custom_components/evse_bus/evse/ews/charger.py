@@ -2,7 +2,7 @@
 
 The box is read first, always, and must be the right one. The limit is said again
 whenever ``rd`` tells another one; a car that charges against the orders is paused; but
-nothing is ever started by itself. PROTOCOLS.md, 4; docs/ews.md.
+nothing is ever started by itself. PROTOCOLS.md, 4; docs/ews-protocol.md.
 """
 
 from functools import partial

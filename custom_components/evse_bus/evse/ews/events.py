@@ -105,7 +105,7 @@ def charge_ended(
     """Return that a charge has ended, by how the port was while it ran, and is now.
 
     The manual does not say when the box takes a charge over as its last one, nor when
-    the counters of the charge under way begin anew (docs/ews.md).
+    the counters of the charge under way begin anew (docs/ews-protocol.md).
     """
     time, energy = seen.last_time, seen.last_energy
     if running is not None and (time, energy) == (
