@@ -21,12 +21,13 @@ from custom_components.evse_bus.evse.ews.listener import (
     IDENTIFY_TIME,
     MOST_UNIDENTIFIED,
 )
+from custom_components.evse_bus.evse.ews.parameters import SystemMode
 from custom_components.evse_bus.evse.ews.readings import capabilities_of
+from custom_components.evse_bus.evse.ews.session import Installation
 from custom_components.evse_bus.evse.ews.timing import (
     COMMAND_MARGIN,
     COMMAND_TIMEOUT,
 )
-from custom_components.evse_bus.evse.model import Capability
 from custom_components.evse_bus.evse.protocols import PROTOCOLS
 from custom_components.evse_bus.flow_listener import FIRST_PORT
 from custom_components.evse_bus.flow_schema import default_of
@@ -119,7 +120,8 @@ def test_every_action_is_told_with_who_may() -> None:
 
 def ews_entities() -> set[str]:
     """Return the names of all entities that an EWS-Box or its listener can have."""
-    has = {*capabilities_of(1, None), Capability.KEYS, None}
+    everything = Installation(mode=SystemMode.CARDS | SystemMode.MANUAL_IO)
+    has = {*capabilities_of(1, everything), None}
     tables = {
         "binary_sensor": (*binary_sensor.CONNECTOR_SENSORS, *binary_sensor.BOX_SENSORS),
         "button": button.BUTTONS,
