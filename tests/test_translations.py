@@ -48,7 +48,7 @@ SAME_EVERYWHERE = {
 }
 SAME = {
     # The language has the same word.
-    "de": {"Name", "Port", "Slave", "Slaves", "Status"},
+    "de": {"Name", "Orange LED", "Port", "Server", "Slave", "Slaves", "Status"},
     "fr": {"Message", "Module {number}", "Port"},
     "nl": {
         *("Even", "Gateway", "Module {number}", "Parameters", "Protocol"),
