@@ -172,3 +172,18 @@ def test_the_set_up() -> None:
     with pytest.raises(TypeError):
         ews_config(ChargerConfig(key="a", name="a", address=1))
     assert EwsPortConfig(key="a", name="a", address=2).port == 2
+
+
+def test_one_block_of_parameters_counts_without_the_other() -> None:
+    """Else a household socket would be taken for a port with a pilot."""
+
+    async def acts(scene: EwsScene) -> None:
+        await asyncio.sleep(30)
+        installation = scene.charger().box.installation
+        assert installation is not None
+        assert installation.mode_1 == (True, False)
+        assert installation.maximum == (20, 20)
+
+    scene = EwsScene(options={"mode1": (True, False), "max_current": 20})
+    scene.box.unanswered.add("rz")
+    play(scene, acts)

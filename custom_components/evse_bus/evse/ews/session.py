@@ -272,15 +272,30 @@ class EwsBox:
     async def read_parameters(self, talk: Talk) -> Turns:
         """Read what is installed; a box that does not tell is taken as it comes."""
         self.parameters_due = talk.now + PARAMETERS_RETRY
+        system: SystemParameters | None = None
         try:
             system = await self.read(talk, SYSTEM_BLOCK.read, SYSTEM_BLOCK.decode)
             yield 0.0
             extra = await self.read(talk, EXTRA_BLOCK.read, EXTRA_BLOCK.decode)
         except ExchangeError:
+            if system is not None:
+                # What one block tells counts, also when the other is not told.
+                self.installation = self._installation(system, None)
             self.installation = self.installation or Installation()
             return
         self.parameters_due = talk.now + PARAMETERS_INTERVAL
-        self.installation = _installation(system, extra.maximum_current_2)
+        self.installation = self._installation(system, extra.maximum_current_2)
+
+    def _installation(
+        self, system: SystemParameters, second: int | None
+    ) -> Installation:
+        """Return what is installed; ``second``: port 2's maximum, if it was told."""
+        first = system.maximum_current or None
+        if second is not None:
+            return _installation(system, (first, second or first))
+        # The last that was known of port 2, as long as nothing else is.
+        before = self.installation.maximum[1] if self.installation else None
+        return _installation(system, (first, before or first))
 
     # -- What it says --------------------------------------------------------------
 
@@ -346,12 +361,11 @@ class EwsBox:
         return self.clock().astimezone(zone).replace(tzinfo=None, microsecond=0)
 
 
-def _installation(system: SystemParameters, second: int) -> Installation:
-    first = system.maximum_current or None
+def _installation(system: SystemParameters, maximum: Pair[int | None]) -> Installation:
     return Installation(
         ports=system.ports,
         mode=system.mode,
         mode_1=system.mode_1,
         fixed_cable=system.fixed_cable,
-        maximum=(first, second or first),
+        maximum=maximum,
     )
