@@ -49,7 +49,7 @@ SAME_EVERYWHERE = {
 SAME = {
     # The language has the same word.
     "de": {"Name", "Orange LED", "Port", "Server", "Slave", "Slaves", "Status"},
-    "fr": {"Message", "Module {number}", "Port"},
+    "fr": {"Charge", "Message", "Module {number}", "Port", "Ventilation"},
     "nl": {
         *("Even", "Gateway", "Module {number}", "Parameters", "Protocol"),
         *("Server", "Slave", "Slaves", "Status", "Time-outs"),
