@@ -9,6 +9,7 @@ import re
 from typing import TYPE_CHECKING, Any
 
 from homeassistant.config_entries import (
+    SOURCE_INTEGRATION_DISCOVERY,
     SOURCE_RECONFIGURE,
     SOURCE_USER,
     ConfigEntry,
@@ -97,6 +98,21 @@ class Flow:
         await flow._start((entry.entry_id, SUBENTRY_CHARGER), context)
         return flow
 
+    @classmethod
+    async def change_options(cls, hass: HomeAssistant, entry: ConfigEntry) -> Flow:
+        flow = cls(hass, entry)
+        flow.texts = english()["options"]
+        flow.manager = hass.config_entries.options
+        await flow._start(entry.entry_id, {"source": SOURCE_USER})
+        return flow
+
+    @classmethod
+    async def discovered(cls, hass: HomeAssistant, flow_id: str) -> Flow:
+        """Open a flow that began by itself, as the frontend does."""
+        flow = cls(hass)
+        flow._take(await flow.manager.async_configure(flow_id))
+        return flow
+
     async def _start(self, handler: object, context: dict[str, Any]) -> None:
         self._take(await self.manager.async_init(handler, context=context))
 
@@ -177,6 +193,9 @@ class Flow:
         if kind is FlowResultType.ABORT:
             if "translation_domain" not in result:
                 self._text(self.texts["abort"][result["reason"]], given)
+        elif kind is FlowResultType.CREATE_ENTRY:
+            if (described := result["description"]) is not None:
+                self._text(self.texts["create_entry"][described], given)
         elif kind is FlowResultType.SHOW_PROGRESS:
             self._text(self.texts["progress"][result["progress_action"]], given)
         elif kind is FlowResultType.MENU:
@@ -227,6 +246,19 @@ class Flow:
         self.shown.append(text.format(**given))
 
 
+def offers(hass: HomeAssistant) -> dict[str, str]:
+    """Return the flows that began by themselves, by the name that they are shown with.
+
+    Each name leads to the id of a flow.
+    """
+    title = english()["config"]["flow_title"]
+    return {
+        title.format(**flow["context"]["title_placeholders"]): flow["flow_id"]
+        for flow in hass.config_entries.flow.async_progress_by_handler(DOMAIN)
+        if flow["context"]["source"] == SOURCE_INTEGRATION_DISCOVERY
+    }
+
+
 def fields(flow: Flow) -> dict[str, Any]:
     """Return what a form offers: suggested values and defaults, by key."""
     return _offered(flow.result["data_schema"])
@@ -265,6 +297,34 @@ async def smartevse_step(
     assert flow.step == "port"
     assert flow.tells("9600 8N1")
     return await flow.submit({"device": device, "line": line})
+
+
+async def ews_step(
+    hass: HomeAssistant, connection: str, device: str | None = None
+) -> Flow:
+    flow = await Flow.add_bus(hass)
+    await flow.submit({"protocol": "ews"})
+    assert flow.step == "connection"
+    assert flow.result["menu_options"] == ["ews_serial", "ews_network"]
+    await flow.choose(connection)
+    if device is None:
+        return flow
+    assert flow.step == "port"
+    assert flow.tells("RS-232 adapter", "115200 8N1")
+    return await flow.submit({"device": device, "line": {}})
+
+
+def box(name: str, *limits: float, **more: object) -> dict[str, Any]:
+    """Return what is typed for an EWS-Box, with a limit for each port that is used."""
+    keys = ("installation_limit", "installation_limit_2")
+    return {
+        "name": name,
+        "ports": str(len(limits)),
+        "fail_safe_current": 6,
+        "expert": {},
+        **dict(zip(keys, limits, strict=False)),
+        **more,
+    }
 
 
 def charger(name: str, limit: float = 16, **more: object) -> dict[str, Any]:

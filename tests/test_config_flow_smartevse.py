@@ -21,7 +21,7 @@ def polled(name: str, limit: float = 16, **more: object) -> dict[str, Any]:
 
 
 async def choose(flow: Flow, unit: str) -> Flow:
-    return await flow.submit({"chargers": unit, "installation_limit": 16})
+    return await flow.submit({"chargers": unit})
 
 
 # -- Which way ---------------------------------------------------------------------
@@ -59,7 +59,7 @@ async def test_box_is_found_in_each_dialect(
         assert flow.progress[-1] == 1
 
         assert flow.step == "select"
-        assert fields(flow) == {"chargers": str(unit), "installation_limit": 16}
+        assert fields(flow) == {"chargers": str(unit)}
         [option] = flow.result["data_schema"].schema["chargers"].config["options"]
         assert option["label"].startswith(f"{unit}: ")
         assert "SmartEVSE v2" in option["label"]

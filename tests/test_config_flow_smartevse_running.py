@@ -35,7 +35,7 @@ async def test_polled_box_stops_with_home_assistant_if_that_was_chosen(
         await bus.wait_for_async(lambda: box.contactor)
         flow = await smartevse_step(hass, "polled", bus.url)
         await flow.wait()
-        await flow.submit({"chargers": "1", "installation_limit": 16})
+        await flow.submit({"chargers": "1"})
         typed = charger("Box", fail_safe_current=8, expert=FAST)
         await flow.submit(typed | {"stop_on_shutdown": stops})
         assert not box.writes

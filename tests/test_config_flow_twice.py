@@ -54,7 +54,7 @@ async def test_two_dialogues_for_one_charger(
         if second_is == "searched":
             await second.choose("scan")
             await second.wait()
-            await second.submit({"chargers": "2", "installation_limit": 16})
+            await second.submit({"chargers": "2"})
         else:
             await second.choose("manual")
             await second.submit({"device_id": "2"})

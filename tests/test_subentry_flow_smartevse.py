@@ -80,7 +80,7 @@ async def test_slave_is_added_to_a_bus_that_runs(hass: HomeAssistant) -> None:
         assert fields(flow)["chargers"] == "3"
         assert flow.progress[-1] == 1
         assert not second.writes
-        await flow.submit({"chargers": "3", "installation_limit": 13})
+        await flow.submit({"chargers": "3"})
         assert flow.tells("firmware 2.17 at 3")
         await flow.submit(charger("New", 13))
         assert flow.step == "confirm_smartevse_master"
@@ -210,7 +210,7 @@ async def test_box_is_searched_on_a_bus_that_has_lost_its_own(
         await flow.choose("scan")
         await flow.wait()
         assert flow.step == "select"
-        await flow.submit({"chargers": "0", "installation_limit": 16})
+        await flow.submit({"chargers": "0"})
         await flow.submit(charger("New") | {"stop_on_shutdown": False})
         await flow.submit()
         await hass.async_block_till_done()

@@ -18,8 +18,10 @@ from homeassistant.helpers.typing import ConfigType
 
 from .const import DOMAIN
 from .coordinator import BusCoordinator, EvseBusConfigEntry
+from .discovery import async_follow_ignored, async_listener_gone
 from .errors import not_ready
 from .evse.errors import LineError
+from .lines import ListenerLines
 from .orders import OrderStore
 from .services import async_register
 from .setup import made_of
@@ -65,6 +67,9 @@ async def async_setup_entry(hass: HomeAssistant, entry: EvseBusConfigEntry) -> b
         await coordinator.async_stop()
         raise
     entry.async_on_unload(entry.add_update_listener(_async_updated))
+    if isinstance(coordinator.lines, ListenerLines):
+        listener = coordinator.lines.listener
+        entry.async_on_unload(async_follow_ignored(hass, entry, listener))
 
     async def follow_time_zone(_event: Event[Any]) -> None:
         await coordinator.async_match_subentries()
@@ -84,7 +89,8 @@ async def async_unload_entry(hass: HomeAssistant, entry: EvseBusConfigEntry) -> 
 
 
 async def async_remove_entry(hass: HomeAssistant, entry: EvseBusConfigEntry) -> None:
-    """Delete the stored orders of a bus that is no more."""
+    """Delete the stored orders of a bus that is no more, and what it offered."""
+    async_listener_gone(hass, entry)
     await OrderStore(hass, entry.entry_id).async_remove()
 
 

@@ -54,6 +54,8 @@ from .flow_supply import check_supply, supply_data, supply_form
 from .setup import line_settings, protocol_of
 from .subentry_flow import ChargerSubentryFlow
 
+_INTERFACES: Final = {"ews": "RS-232"}
+"""What the adapter has to be, where it is not RS-485."""
 _URL_EXAMPLES: Final = "`socket://192.0.2.5:4001`, `rfc2217://192.0.2.5:2217`"
 """Not for translators: what is typed is the same everywhere."""
 
@@ -86,7 +88,10 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
     @override
     def async_supports_options_flow(cls, config_entry: ConfigEntry) -> bool:
         """Return whether it listens: only then there is something to restrict."""
-        return protocol_of(config_entry.data).dials_in
+        # A box that is ignored is an entry, too: one without anything in it.
+        return CONF_PROTOCOL in config_entry.data and (
+            protocol_of(config_entry.data).dials_in
+        )
 
     @staticmethod
     @callback
@@ -367,6 +372,7 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
 def _port_placeholders(protocol: Protocol) -> dict[str, str]:
     return {
         "protocol": protocol.name,
+        "interface": _INTERFACES.get(protocol.key, "RS-485"),
         "settings": str(protocol.settings),
         "examples": _URL_EXAMPLES,
     }

@@ -237,6 +237,8 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         if config == old.config:
             return
         LOGGER.debug("%s: its set-up was changed", config.name)
+        # It may have become a box that is being offered.
+        async_set_up_now(self.hass, subentry)
         if changes_in_place(old.config, config):
             old.set_up(config)
             self.devices.show_charger(unit)

@@ -31,7 +31,6 @@ from .flow_address import ADDRESSES, Errors
 from .flow_schema import (
     COMMANDS,
     DEFAULT_FAIL_SAFE_TIMEOUT,
-    SUGGESTED_LIMIT,
     amperes,
     check_currents,
     check_timeout,
@@ -40,7 +39,6 @@ from .flow_schema import (
     is_number,
     model_name,
     quantity,
-    suggest,
 )
 from .setup import PORT_LIMITS
 
@@ -86,20 +84,30 @@ class Candidate:
     def placeholders(self, protocol: Protocol) -> dict[str, str]:
         """Return what is known of it, for the texts."""
         told = self.found
-        maximum = told.maximum_current if told else None
+        each = (told.maximum_currents or (told.maximum_current,)) if told else (None,)
         return {
             "address": ADDRESSES[protocol.key].show(self.address),
             "model": model_name(told) if told else "?",
+            "firmware": (told and told.info.firmware) or "?",
             "serial": self.serial(protocol) or "?",
-            "maximum": f"{maximum:g} A" if maximum is not None else "?",
+            "maximum": " + ".join("?" if one is None else f"{one:g} A" for one in each),
         }
 
-    def suggestions(self) -> dict[str, Any]:
-        """Return what it told that the form is to begin with."""
-        told = self.found
-        if told is None or not told.maximum_currents:
-            return {}
-        return {CONF_PORTS: str(told.connectors)}
+    def suggestions(self, protocol: Protocol, limit: float) -> dict[str, Any]:
+        """Return what its form is to begin with; ``limit``: of the installation.
+
+        What a port can carry at most is no more than its box has been set up for:
+        a higher limit would only look as if it could be had.
+        """
+        each = self.found.maximum_currents if self.found else ()
+        if not each:
+            return dict.fromkeys(PORT_LIMITS[: protocol.ports], limit)
+        limits = (
+            limit if told is None else max(MINIMUM_CURRENT, min(limit, told))
+            for told in each
+        )
+        offered = dict(zip(PORT_LIMITS, limits, strict=False))
+        return {CONF_PORTS: str(len(each)), **offered}
 
 
 def short_name(protocol: Protocol) -> str:
@@ -138,10 +146,9 @@ def charger_form(
         form[vol.Required(CONF_PORTS, default=counts[-1])] = dropdown(
             CONF_PORTS, counts
         )
-    form[suggest(CONF_INSTALLATION_LIMIT, SUGGESTED_LIMIT)] = amperes(MINIMUM_CURRENT)
+    form[vol.Required(CONF_INSTALLATION_LIMIT)] = amperes(MINIMUM_CURRENT)
     if protocol.ports > 1:
-        second = suggest(CONF_INSTALLATION_LIMIT_2, SUGGESTED_LIMIT, optional=True)
-        form[second] = amperes(MINIMUM_CURRENT)
+        form[vol.Optional(CONF_INSTALLATION_LIMIT_2)] = amperes(MINIMUM_CURRENT)
     if new:
         form[vol.Required(CONF_FAIL_SAFE_CURRENT, default=MINIMUM_CURRENT)] = amperes()
         if protocol.probe_imposes:
@@ -212,8 +219,8 @@ def check_charger(
     """
     errors = check_currents(typed)
     expert = typed[CONF_EXPERT]
-    if typed.get(CONF_PORTS) == "2" and CONF_INSTALLATION_LIMIT_2 not in typed:
-        errors[CONF_INSTALLATION_LIMIT_2] = "second_limit_missing"
+    if typed.get(CONF_PORTS) == "2":
+        errors = _check_second(typed) | errors
     if not typed[CONF_NAME].strip():
         errors[CONF_NAME] = "name_empty"
     if not is_number(typed.get(CONF_ORDER_LIFETIME, 0)):
@@ -228,6 +235,15 @@ def check_charger(
     if others and COMMANDS[-1] in commands:
         errors["base"] = "command_not_alone"
     return errors | check_timeout(typed, expert[CONF_POLL_INTERVAL])
+
+
+def _check_second(typed: Mapping[str, Any]) -> Errors:
+    """Return what is wrong with the limit of a second port."""
+    if (limit := typed.get(CONF_INSTALLATION_LIMIT_2)) is None:
+        return {CONF_INSTALLATION_LIMIT_2: "second_limit_missing"}
+    if typed.get(CONF_FAIL_SAFE_CURRENT, 0) > limit:
+        return {CONF_FAIL_SAFE_CURRENT: "above_second_limit"}
+    return {}
 
 
 def _is_information(text: str | None) -> bool:
@@ -280,6 +296,10 @@ def charger_suggestions(protocol: Protocol, subentry: ConfigSubentry) -> dict[st
     """Return what is stored of a charger as the form shows it."""
     stored = subentry.data
     address = ADDRESSES[protocol.key]
+    place: Address = stored[CONF_ADDRESS]
+    if address.optional and stored[CONF_SERIAL]:
+        # The one that was kept: left empty, any other would be taken from now on.
+        place = stored[CONF_SERIAL]
     expert = {
         key: stored[key]
         for key in (CONF_VOLTAGE, CONF_POLL_INTERVAL, CONF_ORDER_LIFETIME)
@@ -293,7 +313,7 @@ def charger_suggestions(protocol: Protocol, subentry: ConfigSubentry) -> dict[st
         expert[CONF_PHASE_ORDER] = "".join(map(str, stored[CONF_PHASE_ORDER]))
     suggestions = {
         CONF_NAME: subentry.title,
-        address.one: address.show(stored[CONF_ADDRESS]),
+        address.one: address.show(place),
         CONF_INSTALLATION_LIMIT: stored[CONF_INSTALLATION_LIMIT],
         CONF_EXPERT: expert,
     }

@@ -1,7 +1,9 @@
 """Set up a listener that EWS-Boxes dial, change it, and add a box that has dialled."""
 
 from collections.abc import Mapping
+from contextlib import suppress
 from ipaddress import ip_address, ip_network
+import re
 import socket
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, override
@@ -9,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, override
 from homeassistant.components import network
 from homeassistant.config_entries import (
     ConfigEntry,
+    ConfigEntryState,
     ConfigFlow,
     ConfigFlowContext,
     ConfigFlowResult,
@@ -17,10 +20,12 @@ from homeassistant.config_entries import (
     OptionsFlow,
 )
 from homeassistant.const import CONF_HOST, CONF_PORT
+from homeassistant.exceptions import HomeAssistantError
 from homeassistant.helpers.selector import (
     NumberSelector,
     NumberSelectorConfig,
     NumberSelectorMode,
+    SelectOptionDict,
     SelectSelector,
     SelectSelectorConfig,
     SelectSelectorMode,
@@ -67,16 +72,17 @@ _LISTEN_ERRORS: Final[Mapping[type[EvseError], str]] = {
 # -- Where to listen -------------------------------------------------------------
 
 
-def listen_form(addresses: list[str], port: int) -> vol.Schema:
+def listen_form(addresses: Mapping[str, str], port: int) -> vol.Schema:
     """Ask for an address of this machine and a port; another address can be typed."""
+    options = [
+        SelectOptionDict(value=address, label=label)
+        for address, label in addresses.items()
+    ]
     return vol.Schema(
         {
-            vol.Required(
-                CONF_HOST,
-                description={"suggested_value": addresses[0] if addresses else ""},
-            ): SelectSelector(
+            vol.Required(CONF_HOST): SelectSelector(
                 SelectSelectorConfig(
-                    options=addresses,
+                    options=options,
                     custom_value=True,
                     mode=SelectSelectorMode.DROPDOWN,
                 )
@@ -92,9 +98,8 @@ def listen_form(addresses: list[str], port: int) -> vol.Schema:
 
 def listen_data(typed: Mapping[str, Any]) -> tuple[dict[str, Any], Errors]:
     """Return where to listen, of a filled-in form, and what is wrong with it."""
-    host = str(typed[CONF_HOST]).strip()
     try:
-        ip_address(host.partition("%")[0])
+        host = str(ip_address(typed[CONF_HOST].strip()))
     except ValueError:
         return {}, {CONF_HOST: "bad_address"}
     port = typed[CONF_PORT]
@@ -116,11 +121,23 @@ async def async_try_listen(data: Mapping[str, Any]) -> Errors:
     return {}
 
 
-async def async_own_addresses(hass: HomeAssistant) -> list[str]:
-    """Return this machine's addresses, the one that others reach it by first."""
-    first = await network.async_get_source_ip(hass)
-    others = await network.async_get_enabled_source_ips(hass)
-    return list(dict.fromkeys([first, *(str(one) for one in others)]))
+async def async_own_addresses(hass: HomeAssistant) -> dict[str, str]:
+    """Return this machine's addresses and what to call them.
+
+    The one that it is reached by usually comes first. The boxes know IPv4 only, and
+    their network may well be one that Home Assistant does nothing else in.
+    """
+    addresses: dict[str, str] = {}
+    with suppress(HomeAssistantError):
+        # It has no network now.
+        first = await network.async_get_source_ip(hass)
+        addresses[first] = first
+    for adapter in await network.async_get_adapters(hass):
+        for one in adapter["ipv4"]:
+            address = one["address"]
+            if address in addresses or not ip_address(address).is_loopback:
+                addresses[address] = f"{address} ({adapter['name']})"
+    return addresses
 
 
 def free_port(host: str) -> int:
@@ -162,8 +179,15 @@ class ListenerSteps(ChargerSteps[ConfigFlowContext, ConfigFlowResult, str], Conf
         data, result = await self._async_listen("listen", user_input)
         if result is not None:
             return result
+        host = data[CONF_HOST]
+        if ip_address(host).is_unspecified:
+            # That is no address that could be dialled.
+            host = next(iter(await async_own_addresses(self.hass)), host)
         return self.async_create_entry(
-            title=listener_title(data), data=data, description="listening"
+            title=listener_title(data),
+            data=data,
+            description="listening",
+            description_placeholders={"address": host, "port": str(data[CONF_PORT])},
         )
 
     async def async_step_reconfigure_listen(
@@ -199,9 +223,9 @@ class ListenerSteps(ChargerSteps[ConfigFlowContext, ConfigFlowResult, str], Conf
             if not errors:
                 return {CONF_PROTOCOL: "ews_network", **where}, None
         addresses = await async_own_addresses(self.hass)
-        first = addresses[0] if addresses else ""
+        first = next(iter(addresses), "")
         port = await self.hass.async_add_executor_job(free_port, first)
-        suggested = typed or (dict(entry.data) if entry is not None else {})
+        suggested = typed or (entry.data if entry is not None else {CONF_HOST: first})
         return {}, self.async_show_form(
             step_id=step_id,
             data_schema=self.add_suggested_values_to_schema(
@@ -214,10 +238,19 @@ class ListenerSteps(ChargerSteps[ConfigFlowContext, ConfigFlowResult, str], Conf
         self, where: Mapping[str, Any], entry: ConfigEntry | None
     ) -> Errors:
         """Return what is wrong; aborts when another entry listens there."""
-        if entry is not None and where.items() <= entry.data.items():
-            # We listen there ourselves.
-            return {}
         self._async_abort_entries_match(dict(where))
+        if (
+            entry is not None
+            and entry.state is ConfigEntryState.LOADED
+            and where[CONF_PORT] == entry.data[CONF_PORT]
+        ):
+            hosts = {where[CONF_HOST], entry.data[CONF_HOST]}
+            if len(hosts) == 1:
+                # We listen there ourselves.
+                return {}
+            if any(ip_address(host).is_unspecified for host in hosts):
+                # We have the port ourselves: only the address is looked at.
+                return await async_try_listen({**where, CONF_PORT: 0})
         return await async_try_listen(where)
 
     # -- A box that has dialled ----------------------------------------------------
@@ -300,7 +333,11 @@ class ListenerSteps(ChargerSteps[ConfigFlowContext, ConfigFlowResult, str], Conf
 def found_box(serial: str, firmware: str | None) -> FoundCharger:
     """Return what a box tells that is not set up: who it is, and nothing else."""
     info = ChargerInfo(
-        manufacturer="P-CHARGE", model="EWS-Box", serial=serial, firmware=firmware
+        manufacturer="P-CHARGE",
+        model="EWS-Box",
+        serial=serial,
+        # Anybody may have dialled, and texts can have links in them.
+        firmware=re.sub(r"[^\w.-]", "", firmware or "") or None,
     )
     return FoundCharger(address=serial, serial=serial, info=info)
 
@@ -320,18 +357,14 @@ class ListenerOptionsFlow(OptionsFlow):
         self, user_input: dict[str, Any] | None = None
     ) -> ConfigFlowResult:
         """Ask for addresses and networks; none: all may."""
-        errors: Errors = {}
+        wrong = ""
         if user_input is not None:
-            try:
-                allowed = [
-                    str(ip_network(text.strip(), strict=False))
-                    for text in user_input.get(CONF_ALLOWED, ())
-                    if text.strip()
-                ]
-            except ValueError:
-                errors[CONF_ALLOWED] = "bad_network"
-            else:
-                return self.async_create_entry(data={CONF_ALLOWED: allowed})
+            typed = [text.strip() for text in user_input.get(CONF_ALLOWED, ())]
+            wrong = next((text for text in typed if text and not _network(text)), "")
+            if not wrong:
+                # Each only once, in the order in which they were typed.
+                allowed = dict.fromkeys(filter(None, map(_network, typed)))
+                return self.async_create_entry(data={CONF_ALLOWED: list(allowed)})
         form = vol.Schema(
             {
                 vol.Optional(CONF_ALLOWED): TextSelector(
@@ -342,7 +375,17 @@ class ListenerOptionsFlow(OptionsFlow):
         return self.async_show_form(
             step_id="init",
             data_schema=self.add_suggested_values_to_schema(
-                form, user_input or self.config_entry.options
+                form, self.config_entry.options if user_input is None else user_input
             ),
-            errors=errors,
+            errors={CONF_ALLOWED: "bad_network"} if wrong else {},
+            description_placeholders={"network": wrong},
         )
+
+
+def _network(text: str) -> str | None:
+    """Return a network, or the address of one machine, as it is stored."""
+    try:
+        made = ip_network(text, strict=False)
+    except ValueError:
+        return None
+    return str(made.network_address) if made.num_addresses == 1 else str(made)

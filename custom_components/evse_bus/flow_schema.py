@@ -100,10 +100,9 @@ def dropdown(key: str, options: Iterable[str]) -> SelectSelector:
     )
 
 
-def suggest(key: str, value: object, *, optional: bool = False) -> vol.Marker:
+def suggest(key: str, value: object) -> vol.Marker:
     """Return the key of a field that is filled in, but not taken unseen."""
-    marker = vol.Optional if optional else vol.Required
-    return marker(key, description={"suggested_value": value})
+    return vol.Required(key, description={"suggested_value": value})
 
 
 def default_of(protocol: Protocol, name: str) -> Any:  # noqa: ANN401 - any field's
@@ -136,7 +135,8 @@ def check_currents(typed: Mapping[str, Any]) -> Errors:
     }
     if errors:
         return errors
-    if typed.get(CONF_FAIL_SAFE_CURRENT, 0) > typed[CONF_INSTALLATION_LIMIT]:
+    limit = typed.get(CONF_INSTALLATION_LIMIT, MAXIMUM_CURRENT)
+    if typed.get(CONF_FAIL_SAFE_CURRENT, 0) > limit:
         return {CONF_FAIL_SAFE_CURRENT: "above_installation_limit"}
     return {}
 
@@ -277,7 +277,11 @@ def check_impose(protocol: Protocol, typed: Mapping[str, Any]) -> Errors:
 
 
 def found_form(options: list[SelectOptionDict], *, multiple: bool) -> vol.Schema:
-    """Ask which of the chargers found to add, and what their wiring may carry."""
+    """Ask which of the chargers found to add.
+
+    Of several it is also asked what their wiring may carry, once for all; for one
+    alone the next form asks that.
+    """
     every = [option["value"] for option in options]
     chosen: vol.Marker = (
         vol.Required(CONF_CHARGERS, default=every)
@@ -287,12 +291,11 @@ def found_form(options: list[SelectOptionDict], *, multiple: bool) -> vol.Schema
     config = SelectSelectorConfig(
         options=options, multiple=multiple, mode=SelectSelectorMode.LIST
     )
-    return vol.Schema(
-        {
-            chosen: SelectSelector(config),
-            suggest(CONF_INSTALLATION_LIMIT, SUGGESTED_LIMIT): amperes(MINIMUM_CURRENT),
-        }
-    )
+    form: dict[vol.Marker, object] = {chosen: SelectSelector(config)}
+    if multiple:
+        limit = suggest(CONF_INSTALLATION_LIMIT, SUGGESTED_LIMIT)
+        form[limit] = amperes(MINIMUM_CURRENT)
+    return vol.Schema(form)
 
 
 def found_options(

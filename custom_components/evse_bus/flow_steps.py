@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from homeassistant.config_entries import ConfigSubentry, ConfigSubentryData
 from homeassistant.const import CONF_ADDRESS, CONF_NAME
-from homeassistant.data_entry_flow import FlowContext, FlowHandler, FlowResult
+from homeassistant.data_entry_flow import FlowContext, FlowResult
 
 from .const import (
     CONF_INSTALLATION_LIMIT,
     SUBENTRY_CHARGER,
 )
-from .discovery import is_set_up
+from .discovery import box_unique_id, is_set_up
 from .evse.found import Address, ScanReport
 from .flow_address import ADDRESSES, Errors, manual_form, typed_addresses
 from .flow_charger import (
@@ -21,31 +21,31 @@ from .flow_charger import (
     charger_data,
     charger_form,
     check_charger,
-    confirm_row,
     default_name,
 )
+from .flow_confirm import ConfirmSteps
 from .flow_scan import error_key
 from .flow_schema import (
     CONF_CHARGERS,
+    SUGGESTED_LIMIT,
     check_currents,
     found_form,
     found_options,
     model_name,
 )
-from .flow_supply import supply_texts
 from .lines import line_name
 from .setup import charger_unique_id, line_settings
 
 if TYPE_CHECKING:
     from .evse.found import FoundCharger
-    from .evse.protocol import Progress, Protocol
+    from .evse.protocol import Progress
 
 
 class ChargerSteps[
     ContextT: FlowContext,
     ResultT: FlowResult[Any, Any],
     HandlerT,
-](FlowHandler[ContextT, ResultT, HandlerT]):
+](ConfirmSteps[ContextT, ResultT, HandlerT]):
     """From a bus to chargers that are ready to be stored."""
 
     at_once: ClassVar[bool]
@@ -56,26 +56,18 @@ class ChargerSteps[
     def __init__(self) -> None:
         """Start with nothing found."""
         super().__init__()
-        self.protocol: Protocol
-        self.bus_data: dict[str, Any]
-        """Data of the bus's entry."""
         self.suggestions: dict[str, Any] = {}
         """Values typed so far that the next forms offer again."""
         self._scan_task: asyncio.Task[ScanReport] | None = None
         self._report = ScanReport()
         self._error: str | None = None
         self._pending: list[Candidate] = []
-        self._ready: list[ConfigSubentryData] = []
 
     # -- What the two flows do differently ---------------------------------------
 
     @abstractmethod
     async def async_scan(self, progress: Progress) -> ScanReport:
         """Search the bus; leave no port open that was not open before."""
-
-    @abstractmethod
-    def finish(self, chargers: list[ConfigSubentryData]) -> ResultT:
-        """Store the chargers."""
 
     def choices(self) -> tuple[str, ...]:
         """Return where one can go when a search brought nothing to add."""
@@ -232,8 +224,9 @@ class ChargerSteps[
             if not chosen:
                 errors[CONF_CHARGERS] = "nothing_chosen"
             if not errors:
-                limit = user_input[CONF_INSTALLATION_LIMIT]
-                self.suggestions[CONF_INSTALLATION_LIMIT] = limit
+                if CONF_INSTALLATION_LIMIT in user_input:
+                    limit = user_input[CONF_INSTALLATION_LIMIT]
+                    self.suggestions[CONF_INSTALLATION_LIMIT] = limit
                 wanted = {chosen} if isinstance(chosen, str) else set(chosen)
                 return await self.async_begin(
                     Candidate(address=one.address, found=one)
@@ -261,6 +254,8 @@ class ChargerSteps[
             return await self.async_begin([Candidate(address=form.any)])
         if user_input is not None:
             addresses, errors = typed_addresses(self.protocol, user_input, self.taken())
+            if any(self.is_elsewhere(one) for one in addresses):
+                errors[form.one] = "box_already_set_up"
             if not errors:
                 told = {one.address: one for one in self._report.found}
                 return await self.async_begin(
@@ -282,7 +277,7 @@ class ChargerSteps[
     async def async_begin(self, candidates: Iterable[Candidate]) -> ResultT:
         """Ask for the first charger's name and limits."""
         self._pending = list(candidates)
-        self._ready = []
+        self.ready = []
         return await self.async_step_charger()
 
     async def async_step_charger(
@@ -296,17 +291,18 @@ class ChargerSteps[
                 self._pending.pop(0)
                 user_input = None
                 if not self._pending:
-                    return self._confirm()
+                    return self.confirm()
         candidate = self._pending[0]
         address = ADDRESSES[self.protocol.key]
+        limit = self.suggestions.get(CONF_INSTALLATION_LIMIT, SUGGESTED_LIMIT)
         offered = {
             CONF_NAME: default_name(self.protocol, candidate.address),
             address.one: address.show(candidate.address),
-            **candidate.suggestions(),
             **self.suggestions,
+            **candidate.suggestions(self.protocol, limit),
         }
         return self.async_show_form(
-            step_id="charger",
+            step_id="charger" if self.protocol.ports == 1 else "box",
             data_schema=self.add_suggested_values_to_schema(
                 charger_form(
                     self.protocol, ask_address=candidate.address == address.any
@@ -317,16 +313,32 @@ class ChargerSteps[
             description_placeholders=self.placeholders()
             | candidate.placeholders(self.protocol)
             | {
-                "number": str(len(self._ready) + 1),
-                "total": str(len(self._ready) + len(self._pending)),
+                "number": str(len(self.ready) + 1),
+                "total": str(len(self.ready) + len(self._pending)),
             },
+        )
+
+    async def async_step_box(self, user_input: dict[str, Any] | None = None) -> ResultT:
+        """Ask the same for a box with ports of its own: it has texts of its own."""
+        return await self.async_step_charger(user_input)
+
+    def is_elsewhere(self, address: Address, but: ConfigSubentry | None = None) -> bool:
+        """Return whether a box, which can be connected in two ways, is set up in one.
+
+        ``but``: the one that is being changed.
+        """
+        serial = ADDRESSES[self.protocol.key].serial(address)
+        return (
+            self.protocol.ports > 1
+            and serial is not None
+            and is_set_up(self.hass, box_unique_id(serial), but)
         )
 
     def _take_charger(self, candidate: Candidate, typed: dict[str, Any]) -> Errors:
         others = self.others()
         # Of those that are still to come nothing is known, but they will be there.
         expected: list[Mapping[str, Any]] = [one.data for one in others]
-        expected += [one["data"] for one in self._ready]
+        expected += [one["data"] for one in self.ready]
         expected += [{} for _ in self._pending[1:]]
         errors = check_charger(typed, expected)
         if ADDRESSES[self.protocol.key].one in typed:
@@ -337,12 +349,12 @@ class ChargerSteps[
                 candidate = Candidate(address=addresses[0])
         serial = candidate.serial(self.protocol)
         identity = charger_unique_id(self.protocol.key, serial, candidate.address)
-        if identity in {one.unique_id for one in others} or (
-            self.protocol.dials_in and is_set_up(self.hass, identity)
-        ):
+        if identity in {one.unique_id for one in others}:
             errors["base"] = "already_configured"
+        if self.is_elsewhere(candidate.address):
+            errors["base"] = "box_already_set_up"
         if not errors:
-            self._ready.append(
+            self.ready.append(
                 ConfigSubentryData(
                     data=charger_data(candidate.address, serial, typed),
                     subentry_type=SUBENTRY_CHARGER,
@@ -351,53 +363,3 @@ class ChargerSteps[
                 )
             )
         return errors
-
-    # -- What happens when we fall silent ----------------------------------------
-
-    def _confirm(self, user_input: dict[str, Any] | None = None) -> ResultT:
-        # A page that is loaded again asks for the step without having confirmed.
-        if user_input is not None:
-            return self.finish(self._ready)
-        rows = (confirm_row(self.protocol, one) for one in self._ready)
-        return self.async_show_form(
-            step_id=f"confirm_{self.protocol.key}",
-            description_placeholders=supply_texts(self.bus_data)
-            | {"chargers": "\n".join(rows)},
-            last_step=True,
-        )
-
-    async def async_step_confirm_evbox(
-        self, user_input: dict[str, Any] | None = None
-    ) -> ResultT:
-        """Store, now that the user knows an EVBox's fail-safe."""
-        return self._confirm(user_input)
-
-    async def async_step_confirm_abl(
-        self, user_input: dict[str, Any] | None = None
-    ) -> ResultT:
-        """Store, now that the user knows that an ABL box has none."""
-        return self._confirm(user_input)
-
-    async def async_step_confirm_smartevse(
-        self, user_input: dict[str, Any] | None = None
-    ) -> ResultT:
-        """Store, now that the user knows that a polled SmartEVSE has none."""
-        return self._confirm(user_input)
-
-    async def async_step_confirm_smartevse_master(
-        self, user_input: dict[str, Any] | None = None
-    ) -> ResultT:
-        """Store, now that the user knows that slaves stop without us."""
-        return self._confirm(user_input)
-
-    async def async_step_confirm_ews(
-        self, user_input: dict[str, Any] | None = None
-    ) -> ResultT:
-        """Store, now that the user knows what an EWS-Box does without its server."""
-        return self._confirm(user_input)
-
-    async def async_step_confirm_ews_network(
-        self, user_input: dict[str, Any] | None = None
-    ) -> ResultT:
-        """Store, now that the user knows what it does when it cannot dial."""
-        return self._confirm(user_input)

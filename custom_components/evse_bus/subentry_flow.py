@@ -149,7 +149,11 @@ class ChargerSubentryFlow(
                 [address] = addresses
                 serial = self._serial(address, user_input)
                 identity = charger_unique_id(self.protocol.key, serial, address)
-                if identity not in {one.unique_id for one in others}:
+                if identity in {one.unique_id for one in others}:
+                    errors["base"] = "already_configured"
+                elif self.is_elsewhere(address, but=subentry):
+                    errors["base"] = "box_already_set_up"
+                else:
                     data = charger_data(address, serial, user_input)
                     return self.async_update_and_abort(
                         entry,
@@ -158,9 +162,8 @@ class ChargerSubentryFlow(
                         title=user_input[CONF_NAME].strip(),
                         data=data | _fail_safe(subentry.data, data),
                     )
-                errors["base"] = "already_configured"
         return self.async_show_form(
-            step_id="reconfigure",
+            step_id="reconfigure" if self.protocol.ports == 1 else "reconfigure_box",
             data_schema=self.add_suggested_values_to_schema(
                 charger_form(self.protocol, ask_address=True, new=False),
                 user_input or charger_suggestions(self.protocol, subentry),
@@ -168,6 +171,12 @@ class ChargerSubentryFlow(
             errors=errors,
             description_placeholders={"name": subentry.title},
         )
+
+    async def async_step_reconfigure_box(
+        self, user_input: dict[str, Any] | None = None
+    ) -> SubentryFlowResult:
+        """Change the same of a box with ports of its own: it has texts of its own."""
+        return await self.async_step_reconfigure(user_input)
 
     def _serial(self, address: Address, typed: dict[str, Any]) -> str | None:
         form = ADDRESSES[self.protocol.key]
