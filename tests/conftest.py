@@ -33,7 +33,8 @@ def integration_can_load(request: pytest.FixtureRequest) -> None:
     if "hass" not in request.fixturenames:
         return
     request.getfixturevalue("enable_custom_integrations")
-    # Our dependency `usb` would look at this machine's real ports.
+    # Our dependency `usb` would look at this machine's real ports. The other one,
+    # `network`, is set up as it is: the test plugin shows it one adapter, 10.10.10.10.
     request.getfixturevalue("hass").config.components.add("usb")
 
 
@@ -49,6 +50,9 @@ def quick_search(monkeypatch: pytest.MonkeyPatch) -> None:
         smartevse = PROTOCOLS[key]
         timing = replace(smartevse.timing, reply_timeout=0.12)
         monkeypatch.setitem(PROTOCOLS, key, replace(smartevse, timing=timing))
+    ews = PROTOCOLS["ews"]
+    timing = replace(ews.timing, reply_timeout=0.25)
+    monkeypatch.setitem(PROTOCOLS, "ews", replace(ews, timing=timing))
     master = "custom_components.evse_bus.evse.smartevse.master"
     monkeypatch.setattr(sys.modules[master], "LISTENING", 0.3)
 

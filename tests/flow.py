@@ -206,15 +206,16 @@ class Flow:
                 if option in described:
                     self._text(described[option], given)
         elif kind is FlowResultType.FORM:
-            texts = self._step_texts(given)
-            for error in (result["errors"] or {}).values():
-                self._text(self.texts["error"][error], given)
-            if result["data_schema"] is not None:
-                # As the frontend gets it; raises for what cannot be told to it.
-                vol.to_field_list(
-                    result["data_schema"], custom_serializer=cv.custom_serializer
-                )
-                self._fields(result["data_schema"], texts, given)
+            self._form(result, given)
+
+    def _form(self, result: Mapping[str, Any], given: Mapping[str, str]) -> None:
+        texts = self._step_texts(given)
+        for error in (result["errors"] or {}).values():
+            self._text(self.texts["error"][error], given)
+        if (schema := result["data_schema"]) is not None:
+            # As the frontend gets it; raises for what cannot be told to it.
+            vol.to_field_list(schema, custom_serializer=cv.custom_serializer)
+            self._fields(schema, texts, given)
 
     def _step_texts(self, given: Mapping[str, str]) -> dict[str, Any]:
         texts = self.texts["step"][self.step]
