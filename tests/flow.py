@@ -9,6 +9,7 @@ import re
 from typing import TYPE_CHECKING, Any
 
 from homeassistant.config_entries import (
+    SOURCE_IGNORE,
     SOURCE_INTEGRATION_DISCOVERY,
     SOURCE_RECONFIGURE,
     SOURCE_USER,
@@ -258,6 +259,21 @@ def offers(hass: HomeAssistant) -> dict[str, str]:
         for flow in hass.config_entries.flow.async_progress_by_handler(DOMAIN)
         if flow["context"]["source"] == SOURCE_INTEGRATION_DISCOVERY
     }
+
+
+async def ignore(hass: HomeAssistant, flow_id: str) -> ConfigEntry:
+    """Ignore what is offered, as the frontend does; return the entry that says so."""
+    manager = hass.config_entries.flow
+    context = manager.async_get(flow_id)["context"]
+    result = await manager.async_init(
+        DOMAIN,
+        context={
+            "source": SOURCE_IGNORE,
+            "discovery_key": context["discovery_key"],
+        },
+        data={"unique_id": context["unique_id"], "title": "Not ours"},
+    )
+    return result["result"]
 
 
 def fields(flow: Flow) -> dict[str, Any]:

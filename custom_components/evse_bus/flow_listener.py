@@ -34,7 +34,13 @@ from homeassistant.helpers.selector import (
 )
 import probatio as vol
 
-from .const import CONF_ALLOWED, CONF_PROTOCOL, CONF_SERIAL, SUBENTRY_CHARGER
+from .const import (
+    CONF_ALLOWED,
+    CONF_PROTOCOL,
+    CONF_SERIAL,
+    LOGGER,
+    SUBENTRY_CHARGER,
+)
 from .discovery import CONF_ENTRY, CONF_FIRMWARE, CONF_PEER, box_unique_id, is_set_up
 from .evse.errors import (
     EvseError,
@@ -115,8 +121,11 @@ async def async_try_listen(data: Mapping[str, Any]) -> Errors:
     try:
         await listener.start()
     except LineError as error:
-        kinds = (kind for kind in _LISTEN_ERRORS if isinstance(error, kind))
-        return {"base": _LISTEN_ERRORS[next(kinds)]}
+        kind = next(kind for kind in _LISTEN_ERRORS if isinstance(error, kind))
+        if kind is LineError:
+            where = address_name(data[CONF_HOST], data[CONF_PORT])
+            LOGGER.warning("Nobody can dial %s: %s", where, error)
+        return {"base": _LISTEN_ERRORS[kind]}
     await listener.stop()
     return {}
 
