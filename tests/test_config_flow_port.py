@@ -14,6 +14,7 @@ from pytest_homeassistant_custom_component.common import MockConfigEntry
 from custom_components.evse_bus.config_flow import EvseBusConfigFlow
 from custom_components.evse_bus.const import DOMAIN
 from custom_components.evse_bus.evse.protocols import PROTOCOLS
+from custom_components.evse_bus.flow_listener import ListenerOptionsFlow
 from custom_components.evse_bus.flow_schema import MAKES
 from custom_components.evse_bus.subentry_flow import ChargerSubentryFlow
 from tests.flow import IMPOSED, NOWHERE, charger, english, port_step
@@ -155,6 +156,7 @@ def test_every_text_belongs_to_a_step() -> None:
     for texts, flow in (
         (english()["config"], EvseBusConfigFlow),
         (english()["config_subentries"]["charger"], ChargerSubentryFlow),
+        (english()["options"], ListenerOptionsFlow),
     ):
         for step in texts["step"]:
             assert hasattr(flow, f"async_step_{step}")
