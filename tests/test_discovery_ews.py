@@ -2,7 +2,9 @@
 
 from typing import TYPE_CHECKING
 
-from homeassistant.config_entries import ConfigEntryState
+from homeassistant.config_entries import ConfigEntryState, ConfigSubentry
+from homeassistant.const import EVENT_HOMEASSISTANT_STARTED
+from homeassistant.core import CoreState
 from homeassistant.data_entry_flow import FlowResultType, UnknownFlow
 import pytest
 
@@ -170,6 +172,28 @@ async def test_many_serial_numbers_are_not_that_many_offers(
             listener_of(entry).on_stranger(stranger)
         await hass.async_block_till_done(wait_background_tasks=True)
         assert len(offers(hass)) == MOST_OFFERS
+
+
+@pytest.mark.parametrize("meanwhile", ["nothing", "set up", "listener removed"])
+async def test_box_that_dials_while_home_assistant_starts(
+    hass: HomeAssistant, meanwhile: str
+) -> None:
+    """It is offered afterwards, if that still makes sense then."""
+    hass.set_state(CoreState.starting)
+    async with listening(hass) as entry:
+        with dialling(entry) as dialler:
+            await dialler.wait_for_async(lambda: listener_of(entry).strangers)
+            assert not hass.config_entries.flow.async_progress()
+            if meanwhile == "set up":
+                hass.config_entries.async_add_subentry(
+                    entry, ConfigSubentry(**stored_box(SERIAL))
+                )
+            if meanwhile == "listener removed":
+                await hass.config_entries.async_remove(entry.entry_id)
+            hass.set_state(CoreState.running)
+            hass.bus.async_fire(EVENT_HOMEASSISTANT_STARTED)
+            await hass.async_block_till_done(wait_background_tasks=True)
+            assert bool(offers(hass)) is (meanwhile == "nothing")
 
 
 # -- Ignored -----------------------------------------------------------------------
