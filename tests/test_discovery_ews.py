@@ -188,6 +188,7 @@ async def test_box_that_dials_while_home_assistant_starts(
                 hass.config_entries.async_add_subentry(
                     entry, ConfigSubentry(**stored_box(SERIAL))
                 )
+                await hass.async_block_till_done()
             if meanwhile == "listener removed":
                 await hass.config_entries.async_remove(entry.entry_id)
             hass.set_state(CoreState.running)
