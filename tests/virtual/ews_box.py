@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from .car import Car
+    from .ews_driver import Driver
     from .ews_frames import Bcc, Message
     from .wire import Segment
 
@@ -55,6 +56,7 @@ class EwsBox(EwsHands):
     - `commands`, `writes`, `currents_set`, `infos`: what was heard and told
     - `mode`, `rfid`, `manual_io`, `exclusive`: the system mode; see also `system`,
       `user`, `user_info`, `extra`, `cards`: the stored parameters
+    - `drivers`: who press the start key when their cars want to charge
     - `masking`: how `rp` and `ru` hide passwords; `bcc`: how it counts the BCC
     - `ignores_limits`: takes an `st` without effect; `clamps_limits`: takes one that is
       too high as the highest possible; `unanswered`: names that get no answer
@@ -125,6 +127,7 @@ class EwsBox(EwsHands):
         self.extra = ExtraConfiguration()
         self.cards = CardList()
         self.reader = Reader()
+        self.drivers: list[Driver] = []
         two = [*cars, None, None][:2]
         self.ports = (EwsPort(1, two[0]), EwsPort(2, two[1]))
         for port, bit in zip(self.ports, CAR_BITS, strict=True):
@@ -217,6 +220,8 @@ class EwsBox(EwsHands):
             self._power_on_at = None
             self._boot()
         if self.powered:
+            for driver in self.drivers:
+                driver.step(now, self.user_interface)
             self.user_interface.step(now)
             self._block_ports()
             self._watch_server(now)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, cast
 
 from .ews_box import EwsBox
 from .ews_dialler import EwsDialler
+from .ews_driver import Driver
 from .ews_rfid import Card
 from .faults import Faults
 
@@ -108,6 +109,7 @@ def add_arguments(add: Callable[..., object]) -> None:
     add("--count", type=int, default=1, help="so many boxes, if without --serials")
     add("--jumper", type=int, default=32, choices=[13, 20, 32, 63, 70])
     add("--max-current", type=int, default=0, metavar="A", help="0 = the jumper's")
+    add("--drivers", action="store_true", help="press start when a car wants to charge")
     add("--standalone", action="store_true", help="not in server mode")
     add("--rfid", action="store_true", help="with card authentication")
     add("--manual-io", action="store_true", help="keys and LEDs are the server's")
@@ -130,7 +132,7 @@ def boxes(
     if len(serials) > 1 and not options.dial:
         msg = "one box a serial line: several boxes can only --dial"
         raise SystemExit(msg)
-    return [
+    made = [
         EwsBox(
             serial=serial,
             cars=(car(options, 2 * index), car(options, 2 * index + 1)),
@@ -148,6 +150,13 @@ def boxes(
         )
         for index, serial in enumerate(serials)
     ]
+    if options.drivers:
+        for index, box in enumerate(made):
+            box.drivers = [
+                Driver(port, seed=options.seed * 1000 + 2 * index + port.number)
+                for port in box.ports
+            ]
+    return [*made]
 
 
 def fleet(

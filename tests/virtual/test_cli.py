@@ -14,6 +14,7 @@ import time
 
 import pytest
 
+from .ews_client import EwsClient
 from .raw_client import RawClient
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "virtual-chargers"
@@ -114,3 +115,11 @@ def test_smartevse_dialects() -> None:
     ):
         client.write(bytes.fromhex("0103000b0001f5c8"))
         assert client.read(7)[:5].hex() == "010302004d"
+
+
+def test_drivers_at_an_ews_box() -> None:
+    arguments = ["--cars", "plugged", "--drivers", "--time-scale", "8"]
+    with running("ews", *arguments) as (_, url), EwsClient.serial(url) as client:
+        deadline = time.monotonic() + 4
+        while [port["start_mode"] for port in client.ports()] != [1, 1]:
+            assert time.monotonic() < deadline

@@ -1,0 +1,50 @@
+"""A driver at a virtual EWS-Box: presses start, and stop and start again in vain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from random import Random
+from typing import TYPE_CHECKING
+
+from .ews_io import START, STOP
+from .ews_states import Status
+
+if TYPE_CHECKING:
+    from .ews_io import UserInterface
+    from .ews_port import EwsPort
+
+PRESS = 0.3
+STEP_BACK = 5.0
+
+
+@dataclass
+class Driver:
+    """Whoever comes with the car of one port; times in device seconds.
+
+    In server mode the start key only asks the server. Somebody who is not answered
+    for so long takes the request back, and asks anew.
+    """
+
+    port: EwsPort
+    seed: int = 0
+    hesitates: tuple[float, float] = (1.0, 5.0)
+    patience: float = 60.0
+    rng: Random = field(init=False)
+    _next: float | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        """Seed the dice."""
+        self.rng = Random(self.seed)  # noqa: S311 - repeatable on purpose
+
+    def step(self, now: float, keys: UserInterface) -> None:
+        """Do what is due."""
+        port = self.port
+        wants = port.car is not None and port.car.requesting
+        if not wants or port.status != Status.WAITING:
+            self._next = None
+        elif self._next is None:
+            self._next = now + self.rng.uniform(*self.hesitates)
+        elif now >= self._next:
+            asked = port.start_mode != 0
+            keys.press(port.number, STOP if asked else START, now, PRESS)
+            self._next = now + (STEP_BACK if asked else self.patience)
