@@ -3,19 +3,18 @@
 import asyncio
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-import errno
 import fcntl
 import signal
-import socket
 import sys
 from typing import Final
 
 from .buses import BUSES, DemoBus
 from .client import Client
 from .home import furnish
+from .ports import check_port, with_listen_port
 from .processes import Program
 from .say import Progress, say
-from .settings import HOST, PASSWORD, ROOT, USER, DemoError, Settings, from_environment
+from .settings import PASSWORD, ROOT, USER, DemoError, Settings, from_environment
 from .storage import prepare
 
 GLANCE: Final = 0.2
@@ -32,6 +31,7 @@ def main() -> int:
         settings = from_environment()
         with alone(settings):
             check_port(settings)
+            settings = with_listen_port(settings)
             prepare(settings)
             asyncio.run(_until_signal(settings))
     except DemoError as error:
@@ -61,20 +61,6 @@ def alone(settings: Settings) -> Iterator[None]:
             )
         place.write_text(here, encoding="utf-8")
         yield
-
-
-def check_port(settings: Settings) -> None:
-    """Raise DemoError when Home Assistant could not listen there."""
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((HOST, settings.port))
-        except OSError as error:
-            taken = error.errno == errno.EADDRINUSE
-            why = "is taken by another program" if taken else f"cannot be used: {error}"
-            raise DemoError(
-                f"port {settings.port} {why}; set EVSE_BUS_DEMO_PORT to another one"
-            ) from None
 
 
 async def _until_signal(settings: Settings) -> None:
@@ -111,7 +97,8 @@ async def _run(settings: Settings, programs: list[Program]) -> None:
             for program, bus in zip(programs, BUSES, strict=True)
         )
     )
-    say(f"virtual buses: {', '.join(str(settings.link(b.protocol)) for b in BUSES)}")
+    lines = [str(settings.link(bus.protocol)) for bus in BUSES if not bus.dials]
+    say(f"virtual buses: {', '.join(lines)}")
     while True:
         home = await _start_home(settings)
         programs.append(home)
@@ -136,8 +123,8 @@ async def _start_bus(settings: Settings, bus: DemoBus) -> Program:
         bus.title,
         sys.executable,
         ROOT / "scripts" / "virtual-chargers",
-        *bus.virtual,
-        *("--pty", str(settings.link(bus.protocol)), "--verbose"),
+        *bus.arguments(settings),
+        "--verbose",
         log=settings.folder / f"bus-{bus.protocol}.log",
         cwd=ROOT,
     )

@@ -1,8 +1,10 @@
 """The buses of the demo: what is on them, and how a person would add them."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final
+
+from .settings import HOST, Settings
 
 type Answer = Mapping[str, Any] | Callable[[Mapping[str, Any]], Mapping[str, Any]]
 """What to fill into a step, or how to tell from what the step shows."""
@@ -16,15 +18,19 @@ class DemoBus:
     """Key of the integration's; names the port and the log as well."""
     title: str
     virtual: tuple[str, ...]
-    """Arguments of scripts/virtual-chargers."""
+    """Arguments of scripts/virtual-chargers, but for the line."""
+    dials: bool = False
+    """Its boxes dial Home Assistant; there is no port, and nothing to search."""
     names: Mapping[str, str]
     """Name of a charger by its address, as the config flow shows it."""
     currents: Mapping[str, float]
-    """Charging current to begin with by name, A."""
+    """Charging current to begin with by name, A; that of each port where it has some."""
+    limits: Mapping[str, float] = field(default_factory=dict)
+    """Installation limits as each charger's form has them, where not suggested."""
     connectors: int
     choose: Mapping[str, Answer]
     """Steps of the config flow up to the port."""
-    search: Mapping[str, Answer]
+    search: Mapping[str, Answer] = field(default_factory=dict)
     """Steps from the port to the chargers found."""
 
     @property
@@ -32,19 +38,31 @@ class DemoBus:
         """Return what the virtual chargers say when the port is there."""
         return f"ready {self.virtual[0]} "
 
-    def answers(self, port: str) -> dict[str, Answer]:
-        """Return what to answer in the config flow."""
+    def arguments(self, settings: Settings) -> tuple[str, ...]:
+        """Return all arguments of scripts/virtual-chargers."""
+        if self.dials:
+            return (*self.virtual, "--dial", f"{HOST}:{settings.listen_port}")
+        return (*self.virtual, "--pty", str(settings.link(self.protocol)))
+
+    def answers(self, settings: Settings) -> dict[str, Answer]:
+        """Return what to answer in the config flow, and when a box has dialled."""
+        listen = {"host": HOST, "port": settings.listen_port}
+        line: dict[str, Answer] = (
+            {"listen": listen, "discovered": {}}
+            if self.dials
+            else {"port": {"device": str(settings.link(self.protocol))}}
+        )
         return {
             **self.choose,
-            "port": {"device": port},
+            **line,
             **self.search,
-            "charger": self._name,
+            "charger": self._charger,
             f"confirm_{self.protocol}": {},
         }
 
-    def _name(self, step: Mapping[str, Any]) -> Mapping[str, Any]:
+    def _charger(self, step: Mapping[str, Any]) -> Mapping[str, Any]:
         address = step["description_placeholders"]["address"]
-        return {"name": self.names[address]}
+        return {"name": self.names[address], **self.limits}
 
 
 _LIFE: Final = (
@@ -120,6 +138,39 @@ BUSES: Final = (
             # Less than both could use: one car more or less can be seen.
             "supply": {"supply_limit": 25, "supply_minimum": 6},
             "select": {"installation_limit": 16},
+        },
+    ),
+    DemoBus(
+        protocol="ews",
+        title="EWS-Box on a serial line",
+        virtual=(
+            *("ews", "--serials", "201609000417", "--drivers", "--seed", "5"),
+            *_LIFE,
+        ),
+        names={"201609000417": "Workshop"},
+        currents={"Workshop": 16.0},
+        connectors=2,
+        choose={
+            "user": {"protocol": "ews"},
+            "connection": {"next_step_id": "ews_serial"},
+        },
+        search={"select": {"installation_limit": 16}},
+    ),
+    DemoBus(
+        protocol="ews_network",
+        title="EWS-Box on the network",
+        virtual=(
+            *("ews", "--serials", "201802000093", "--drivers", "--seed", "6"),
+            *_LIFE,
+        ),
+        dials=True,
+        names={"201802000093": "Loading bay"},
+        currents={"Loading bay": 20.0},
+        limits={"installation_limit": 32, "installation_limit_2": 20},
+        connectors=2,
+        choose={
+            "user": {"protocol": "ews"},
+            "connection": {"next_step_id": "ews_network"},
         },
     ),
 )

@@ -9,12 +9,14 @@ TITLE: Final = "Chargers"
 URL_PATH: Final = "evse-chargers"
 ICON: Final = "mdi:ev-station"
 BUS_ICON: Final = "mdi:source-branch"
+PLUG_ICON: Final = "mdi:ev-plug-type2"
 POWER: Final = ("power", "estimated_power")
 """Keys of what a connector uses, measured or estimated."""
 
 FULL: Final = 12
-HALF: Final = 6
-"""Columns of a section's twelve."""
+WIDE: Final = 7
+NARROW: Final = FULL - WIDE
+"""Columns of a section's twelve. Words need more of them than numbers."""
 HISTORY_HOURS: Final = 0.25
 
 type Card = dict[str, Any]
@@ -64,7 +66,10 @@ def _bus_sections(bus: ListedBus) -> list[Card]:
     if supply is None:
         return [_section(_charger_cards(charger)) for charger in bus.chargers]
     cards = [
-        _heading(bus.name, BUS_ICON, "title", bus.find("second_master")),
+        # Without the port, for which a heading has no room.
+        _heading(
+            bus.name.partition(" (")[0], BUS_ICON, "title", bus.find("second_master")
+        ),
         supply,
         *(card for charger in bus.chargers for card in _charger_cards(charger)),
     ]
@@ -73,38 +78,49 @@ def _bus_sections(bus: ListedBus) -> list[Card]:
 
 def _charger_cards(charger: ListedCharger) -> list[Card | None]:
     cards = [
-        _heading(charger.name, ICON, "title", charger.find("problem")),
-        _tile(
-            charger.find("charging_current"),
-            FULL,
-            name="Charging current",
-            icon="mdi:speedometer",
-            features=[{"type": "numeric-input", "style": "slider"}],
-        ),
-        _tile(
-            charger.find("charging_allowed"),
-            FULL,
-            name="Charging allowed",
-            features=[{"type": "toggle"}],
-            features_position="inline",
-        ),
+        _heading(charger.name, ICON, "title", charger.find("problem", "connected")),
+        *_control_cards(charger),
     ]
     several = len(charger.connectors) > 1
     for connector in charger.connectors.values():
         if several:
-            cards.append(_heading(connector.name, "mdi:ev-plug-type2", "subtitle"))
-        cards += _connector_cards(connector)
+            problem = connector.find("problem")
+            cards.append(_heading(connector.name, PLUG_ICON, "subtitle", problem))
+        cards += [
+            # The ports of an EWS-Box are chargers of their own.
+            *_control_cards(connector),
+            *_connector_cards(connector),
+        ]
     if not _measured(charger):
         cards.append(
             _tile(
                 charger.find("offered_current"),
-                HALF,
+                NARROW,
                 name="Offered",
                 icon="mdi:current-ac",
                 color="amber",
             )
         )
     return cards
+
+
+def _control_cards(part: Part) -> list[Card | None]:
+    return [
+        _tile(
+            part.find("charging_current"),
+            FULL,
+            name="Charging current",
+            icon="mdi:speedometer",
+            features=[{"type": "numeric-input", "style": "slider"}],
+        ),
+        _tile(
+            part.find("charging_allowed"),
+            FULL,
+            name="Charging allowed",
+            features=[{"type": "toggle"}],
+            features_position="inline",
+        ),
+    ]
 
 
 def _measured(charger: ListedCharger) -> bool:
@@ -119,19 +135,40 @@ def _connector_cards(connector: Part) -> list[Card | None]:
         # An EVBox module does not tell its status, but whether current flows.
         _tile(
             connector.find("status", "charging"),
-            HALF,
+            WIDE,
             name="Status",
             icon="mdi:car-electric",
             color="green",
         ),
         _tile(
             connector.find(*POWER),
-            HALF,
-            name="Power" if "power" in connector.entities else "Power (estimated)",
+            NARROW,
+            name="Power" if "power" in connector.entities else "Est. power",
             icon="mdi:flash",
             color="amber",
         ),
         _currents(connector),
+        _tile(
+            connector.find("session_energy"),
+            NARROW,
+            name="This charge",
+            icon="mdi:battery-charging",
+            color="amber",
+        ),
+        _tile(
+            connector.find("last_result"),
+            WIDE,
+            name="Last result",
+            icon="mdi:flag-checkered",
+        ),
+        _tile(
+            connector.find("start_requested"),
+            WIDE,
+            name="Start requested",
+            icon="mdi:gesture-tap-button",
+            color="amber",
+        ),
+        _tile(connector.find("locked"), NARROW, name="Cable"),
     ]
 
 

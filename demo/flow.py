@@ -46,10 +46,46 @@ async def add_entry(
     ``waiting`` is told which step takes a while. Raises DemoError.
     """
     step = await client.post(FLOWS, {"handler": domain})
+    return await _to_the_end(client, step, answers, waiting, "already_configured")
+
+
+async def find_offer(client: Client, domain: str, unique_id: str) -> str | None:
+    """Return the flow of something that was discovered, once it is offered."""
+    flows = await client.command("config_entries/flow/progress")
+    return next(
+        (
+            flow["flow_id"]
+            for flow in flows
+            if flow["handler"] == domain
+            and flow["context"].get("unique_id") == unique_id
+        ),
+        None,
+    )
+
+
+async def add_discovered(
+    client: Client,
+    flow_id: str,
+    answers: Mapping[str, Answer],
+    waiting: Callable[[str], None],
+) -> None:
+    """Go through the flow of a box that has dialled. Raises DemoError."""
+    step = await client.get(f"{FLOWS}/{flow_id}")
+    await _to_the_end(client, step, answers, waiting, "box_added")
+
+
+async def _to_the_end(
+    client: Client,
+    step: Mapping[str, Any],
+    answers: Mapping[str, Answer],
+    waiting: Callable[[str], None],
+    good_end: str,
+) -> bool:
+    """Go on from a step; return whether it made an entry, or ended as it may."""
     flow = f"{FLOWS}/{step['flow_id']}"
     while step["type"] != "create_entry":
         if step["type"] == "abort":
-            if step["reason"] == "already_configured":
+            if step["reason"] == good_end:
                 return False
             raise DemoError(f"The config flow gave up: {step['reason']}")
         try:

@@ -1,20 +1,23 @@
-"""Makes a fresh Home Assistant the demo's: buses, first limits, dashboard."""
+"""Makes a fresh Home Assistant the demo's: buses, limits, automation, dashboard."""
 
 import asyncio
 from collections.abc import Mapping
 import json
 from typing import Any, Final
 
-from .buses import BUSES, DemoBus
+from .automation import AUTOMATION_ID, answer_start_requests
+from .buses import BUSES, Answer, DemoBus
 from .client import Client
 from .dashboard import ICON, TITLE, URL_PATH, dashboard
-from .flow import add_entry
+from .flow import add_discovered, add_entry, find_offer
 from .listing import DOMAIN, ListedBus, list_buses
 from .say import Progress, say
 from .settings import DemoError, Settings
 
 PATIENCE: Final = 60.0
 """Seconds that all chargers get to show all their connectors."""
+BOX_PATIENCE: Final = 20.0
+"""Seconds that a box gets to dial."""
 GLANCE: Final = 0.5
 
 
@@ -27,15 +30,52 @@ async def furnish(client: Client, settings: Settings) -> None:
             await _first_limits(client, bus, buses)
     else:
         buses = await _listed(client)
+    await _add_automation(client, buses)
     await _show_dashboard(client, settings, buses)
 
 
 async def _add_bus(client: Client, settings: Settings, bus: DemoBus) -> bool:
-    port = str(settings.link(bus.protocol))
+    """Return whether anything of it was missing."""
+    answers = bus.answers(settings)
     with Progress(f"{bus.title}: config flow") as progress:
-        new = await add_entry(client, DOMAIN, bus.answers(port), progress.show)
+        new = await add_entry(client, DOMAIN, answers, progress.show)
         progress.outcome = "gone through" if new else "knows this bus already"
-        return new
+    if bus.dials:
+        for serial in bus.names:
+            new |= await _add_box(client, bus, serial, answers)
+    return new
+
+
+async def _add_box(
+    client: Client, bus: DemoBus, serial: str, answers: Mapping[str, Answer]
+) -> bool:
+    """Add a box that has dialled, as it is offered; return whether it was missing."""
+    unique_id = f"ews_{serial}"
+    with Progress(f"{bus.names[serial]}: discovered") as progress:
+        if unique_id in await _chargers(client):
+            progress.outcome = "knows this box already"
+            return False
+        while (flow := await find_offer(client, DOMAIN, unique_id)) is None:
+            if progress.seconds > BOX_PATIENCE:
+                # Somebody may have ignored it.
+                progress.outcome = "it is not offered"
+                return False
+            progress.show("waiting until it dials")
+            await asyncio.sleep(GLANCE)
+        await add_discovered(client, flow, answers, progress.show)
+        progress.outcome = "added"
+        return True
+
+
+async def _chargers(client: Client) -> set[str]:
+    """Return the unique ids of all chargers that are set up."""
+    found: set[str] = set()
+    for entry in await client.command("config_entries/get", domain=DOMAIN):
+        subentries = await client.command(
+            "config_entries/subentries/list", entry_id=entry["entry_id"]
+        )
+        found.update(one["unique_id"] for one in subentries)
+    return found
 
 
 async def _listed(client: Client) -> list[ListedBus]:
@@ -52,7 +92,10 @@ async def _all_listed(client: Client) -> list[ListedBus]:
         while True:
             buses = await _listed(client)
             listed = sum(
-                len(charger.connectors) for bus in buses for charger in bus.chargers
+                connector.find("status", "charging") is not None
+                for bus in buses
+                for charger in bus.chargers
+                for connector in charger.connectors.values()
             )
             if listed >= expected:
                 return buses
@@ -67,11 +110,21 @@ async def _first_limits(client: Client, bus: DemoBus, buses: list[ListedBus]) ->
     """Raise the limits from the fail-safe values that a new charger begins with."""
     for listed in buses:
         for charger in listed.chargers:
-            entity = charger.find("charging_current")
-            if entity is None or charger.name not in bus.currents:
+            if charger.name not in bus.currents:
                 continue
-            values = {"entity_id": entity, "value": bus.currents[charger.name]}
-            await client.post("services/number/set_value", values)
+            for part in (charger, *charger.connectors.values()):
+                if entity := part.find("charging_current"):
+                    values = {"entity_id": entity, "value": bus.currents[charger.name]}
+                    await client.post("services/number/set_value", values)
+
+
+async def _add_automation(client: Client, buses: list[ListedBus]) -> None:
+    """Let drivers charge who ask for it; what somebody made of it stays."""
+    wanted = answer_start_requests(buses)
+    entities = await client.command("config/entity_registry/list")
+    there = {one["unique_id"] for one in entities if one["platform"] == "automation"}
+    if wanted is not None and AUTOMATION_ID not in there:
+        await client.post(f"config/automation/config/{AUTOMATION_ID}", wanted)
 
 
 async def _show_dashboard(

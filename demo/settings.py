@@ -23,10 +23,12 @@ class DemoError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """The two choices a person has, and what follows from them."""
+    """The choices a person has, and what follows from them."""
 
     folder: Path
     port: int = DEFAULT_PORT
+    listen_port: int = 0
+    """Where an EWS-Box dials; chosen at the first start."""
 
     @property
     def url(self) -> str:

@@ -20,6 +20,7 @@ TOKEN_LIFE: Final = timedelta(days=3650)
 
 CONFIGURATION: Final = """\
 # Written by scripts/demo at each start. Only what works without internet.
+automation: !include automations.yaml
 config:
 energy:
 frontend:
@@ -49,6 +50,10 @@ def prepare(settings: Settings) -> None:
         ROOT / "custom_components" / "evse_bus",
     )
     (config / "configuration.yaml").write_text(CONFIGURATION, encoding="utf-8")
+    automations = config / "automations.yaml"
+    if not automations.exists():
+        # Filled by Home Assistant's own editor, which the demo uses as well.
+        automations.write_text("[]\n", encoding="utf-8")
     if not settings.token.exists() or _stored_port(config) != settings.port:
         # Home Assistant's own event loop would want to handle signals.
         asyncio.run(_write(settings))

@@ -1,0 +1,47 @@
+"""The automation that lets cars charge at the EWS-Boxes. Pure.
+
+In its server mode such a box starts no charge by itself: a driver presses start, and
+waits until Home Assistant allows it.
+"""
+
+from collections.abc import Iterable
+from typing import Any, Final
+
+from .listing import ListedBus
+
+AUTOMATION_ID: Final = "evse_bus_demo_start_requests"
+"""Where Home Assistant stores it."""
+
+
+def answer_start_requests(buses: Iterable[ListedBus]) -> dict[str, Any] | None:
+    """Return an automation that answers yes, at each port; ``None``: there is none."""
+    ports = [
+        (asked, allow)
+        for bus in buses
+        for charger in bus.chargers
+        for port in charger.connectors.values()
+        if (asked := port.find("start_requested"))
+        and (allow := port.find("charging_allowed"))
+    ]
+    if not ports:
+        return None
+    return {
+        "alias": "Answer start requests",
+        "description": (
+            "Whoever presses start at an EWS-Box may charge. The trigger's ID is the"
+            " switch of the same port."
+        ),
+        "triggers": [
+            {"trigger": "state", "entity_id": asked, "to": "on", "id": allow}
+            for asked, allow in ports
+        ],
+        "conditions": [],
+        "actions": [
+            {
+                "action": "switch.turn_on",
+                "target": {"entity_id": "{{ trigger.id }}"},
+            }
+        ],
+        # Several drivers may press at once.
+        "mode": "parallel",
+    }
