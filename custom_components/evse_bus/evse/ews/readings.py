@@ -54,10 +54,11 @@ def capabilities_of(
     """Return what a port has; mode 1 has no pilot, a fixed cable no lock.
 
     Cards are there unless the box says that it asks for none; its keys are told only
-    where they are the server's to watch (3.2.3).
+    where they are the server's to watch (3.2.3). What its parameters may take away is
+    left out before they are known: what was shown once would stay.
     """
     if installation is None:
-        return _ALL
+        return _ALL - _MODE_3_ONLY - {Capability.CARDS}
     known = set(_ALL)
     if installation.mode_1[port - 1]:
         known -= _MODE_3_ONLY
