@@ -14,9 +14,8 @@ POWER: Final = ("power", "estimated_power")
 """Keys of what a connector uses, measured or estimated."""
 
 FULL: Final = 12
-WIDE: Final = 7
-NARROW: Final = FULL - WIDE
-"""Columns of a section's twelve. Words need more of them than numbers."""
+HALF: Final = 6
+"""Columns of a section's twelve."""
 HISTORY_HOURS: Final = 0.25
 
 type Card = dict[str, Any]
@@ -95,7 +94,7 @@ def _charger_cards(charger: ListedCharger) -> list[Card | None]:
         cards.append(
             _tile(
                 charger.find("offered_current"),
-                NARROW,
+                FULL,
                 name="Offered",
                 icon="mdi:current-ac",
                 color="amber",
@@ -135,58 +134,57 @@ def _connector_cards(connector: Part) -> list[Card | None]:
         # An EVBox module does not tell its status, but whether current flows.
         _tile(
             connector.find("status", "charging"),
-            WIDE,
+            FULL,
             name="Status",
             icon="mdi:car-electric",
             color="green",
         ),
-        _tile(
-            connector.find(*POWER),
-            NARROW,
-            name="Power" if "power" in connector.entities else "Est. power",
-            icon="mdi:flash",
-            color="amber",
-        ),
-        _currents(connector),
+        *_used(connector),
         _tile(
             connector.find("session_energy"),
-            NARROW,
+            HALF,
             name="This charge",
             icon="mdi:battery-charging",
             color="amber",
         ),
         _tile(
-            connector.find("last_result"),
-            WIDE,
-            name="Last result",
-            icon="mdi:flag-checkered",
-        ),
-        _tile(
             connector.find("start_requested"),
-            WIDE,
+            HALF,
             name="Start requested",
             icon="mdi:gesture-tap-button",
             color="amber",
         ),
-        _tile(connector.find("locked"), NARROW, name="Cable"),
+        _tile(connector.find("locked"), HALF, name="Plug lock"),
+        _tile(
+            connector.find("last_result"),
+            FULL,
+            name="Last result",
+            icon="mdi:flag-checkered",
+        ),
     ]
 
 
-def _currents(connector: Part) -> Card | None:
+def _used(connector: Part) -> list[Card | None]:
+    """Return what a car uses: in a row where there are currents as well."""
+    power = connector.find(*POWER)
+    name = "Power" if "power" in connector.entities else "Est. power"
     phases = [
         {"entity": entity, "name": phase.upper()}
         for phase in ("l1", "l2", "l3")
         if (entity := connector.find(f"current_{phase}"))
     ]
     if not phases:
-        return None
-    return {
-        "type": "glance",
-        "columns": len(phases),
-        "show_icon": False,
-        "entities": phases,
-        "grid_options": {"columns": FULL},
-    }
+        return [_tile(power, HALF, name=name, icon="mdi:flash", color="amber")]
+    values = [{"entity": power, "name": name}] if power else []
+    return [
+        {
+            "type": "glance",
+            "columns": len(values + phases),
+            "show_icon": False,
+            "entities": values + phases,
+            "grid_options": {"columns": FULL},
+        }
+    ]
 
 
 def _history_section(chargers: Sequence[ListedCharger]) -> Card:

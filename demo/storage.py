@@ -49,14 +49,18 @@ def prepare(settings: Settings) -> None:
         config / "custom_components" / "evse_bus",
         ROOT / "custom_components" / "evse_bus",
     )
-    (config / "configuration.yaml").write_text(CONFIGURATION, encoding="utf-8")
-    automations = config / "automations.yaml"
-    if not automations.exists():
-        # Filled by Home Assistant's own editor, which the demo uses as well.
-        automations.write_text("[]\n", encoding="utf-8")
+    write_configuration(config)
     if not settings.token.exists() or _stored_port(config) != settings.port:
         # Home Assistant's own event loop would want to handle signals.
         asyncio.run(_write(settings))
+
+
+def write_configuration(config: Path) -> None:
+    """Write what is in YAML; automations only where there is no file for them yet."""
+    (config / "configuration.yaml").write_text(CONFIGURATION, encoding="utf-8")
+    automations = config / "automations.yaml"
+    if not automations.exists():
+        automations.write_text("[]\n", encoding="utf-8")
 
 
 def _link(link: Path, target: Path) -> None:

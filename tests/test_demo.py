@@ -1,4 +1,4 @@
-"""The demo: its first start against the real API, and its pure parts.
+"""The demo: its first start against the real API, and the programs it starts.
 
 Left to be tried by hand: a whole Home Assistant with its frontend.
 """
@@ -10,6 +10,7 @@ import os
 from pathlib import Path
 import socket
 import sys
+from typing import Any
 
 from homeassistant.auth import auth_manager_from_config
 from homeassistant.config_entries import ConfigEntries
@@ -21,26 +22,45 @@ import pytest
 from pytest_homeassistant_custom_component.typing import ClientSessionGenerator
 
 from demo import home, processes
-from demo.__main__ import alone, check_port
+from demo.automation import AUTOMATION_ID
 from demo.buses import BUSES
 from demo.client import Client
 from demo.dashboard import dashboard
-from demo.flow import add_entry, fill
-from demo.listing import DOMAIN, ListedBus, list_buses
+from demo.flow import add_entry
+from demo.listing import DOMAIN, ListedBus
 from demo.processes import Program
-from demo.settings import DemoError, Settings, from_environment
-from demo.storage import prepare
+from demo.settings import DemoError, Settings
+from demo.storage import prepare, write_configuration
 
-from .virtual import AblBox, Car, EvboxChargePoint, Module, SmartEvse, VirtualBus
+from .virtual import (
+    AblBox,
+    Car,
+    EvboxChargePoint,
+    EwsBox,
+    EwsDialler,
+    Module,
+    SmartEvse,
+    VirtualBus,
+)
 
 # -- The first start, without frontend -------------------------------------------
 
 
+AUTOMATION = f"config/automation/config/{AUTOMATION_ID}"
+
+
 @pytest.fixture
 async def client(
-    hass: HomeAssistant, hass_client: ClientSessionGenerator, hass_access_token: str
+    hass: HomeAssistant,
+    hass_client: ClientSessionGenerator,
+    hass_access_token: str,
+    tmp_path: Path,
 ) -> AsyncIterator[Client]:
-    for component in ("http", "websocket_api", "api", "config"):
+    config = tmp_path / "config"
+    config.mkdir()
+    write_configuration(config)
+    hass.config.config_dir = str(config)
+    for component in ("http", "websocket_api", "api", "config", "automation"):
         assert await async_setup_component(hass, component, {})
     server = (await hass_client()).server
     url = str(server.make_url("")).rstrip("/")
@@ -55,13 +75,13 @@ def _plugged() -> Car:
 
 
 def _settings(folder: Path) -> Settings:
-    return Settings(folder=folder, port=8123)
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return Settings(folder=folder, port=8123, listen_port=free.getsockname()[1])
 
 
-@pytest.mark.usefixtures("quick_search")
-async def test_buses_are_added_once_and_all_is_on_the_dashboard(
-    hass: HomeAssistant, client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def shown(monkeypatch: pytest.MonkeyPatch) -> list[list[ListedBus]]:
+    """Return what the dashboard is made of, at each start."""
     saved: list[list[ListedBus]] = []
 
     async def show(
@@ -70,6 +90,17 @@ async def test_buses_are_added_once_and_all_is_on_the_dashboard(
         saved.append(buses)
 
     monkeypatch.setattr(home, "_show_dashboard", show)
+    return saved
+
+
+@pytest.mark.usefixtures("quick_search")
+async def test_buses_are_added_once_and_all_is_on_the_dashboard(
+    hass: HomeAssistant,
+    client: Client,
+    tmp_path: Path,
+    shown: list[list[ListedBus]],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     settings = _settings(tmp_path)
     points = [
         EvboxChargePoint(1923054, [Module(), Module()]),
@@ -83,54 +114,101 @@ async def test_buses_are_added_once_and_all_is_on_the_dashboard(
     slaves = [
         SmartEvse(load_balance=unit, max_current=16, car=_plugged()) for unit in (2, 3)
     ]
+    workshop = EwsBox(serial="201609000417", cars=(_plugged(), None))
+    loading_bay = EwsBox(serial="201802000093", cars=(None, _plugged()))
     with (
         VirtualBus.pty(*points, link=str(settings.link("evbox"))),
         VirtualBus.pty(*boxes, link=str(settings.link("abl"))),
         VirtualBus.pty(polled, link=str(settings.link("smartevse"))) as single,
         VirtualBus.pty(*slaves, link=str(settings.link("smartevse_master"))) as shared,
+        VirtualBus.pty(workshop, link=str(settings.link("ews"))) as serial,
+        EwsDialler(loading_bay, "127.0.0.1", settings.listen_port) as dialler,
     ):
         await home.furnish(client, settings)
         # The chargers themselves follow what the demo begins with.
         assert [point.limits_in_force for point in points] == [(32.0,) * 3] * 2
         assert [round(box.ic_amps) for box in boxes] == [16, 10, 13]
+        assert [port.limit for port in workshop.ports] == [16, 16]
+        assert [port.limit for port in loading_bay.ports] == [20, 20]
         await single.wait_for_async(lambda: polled.pilot_current == 16, 15)
         # Two cars share what is there.
         await shared.wait_for_async(
             lambda: [slave.pilot_current for slave in slaves] == [12.5, 12.5], 15
         )
+        # A driver who presses start is answered, at the port where it was.
+        for bus, box, number in ((serial, workshop, 1), (dialler, loading_bay, 2)):
+            port = box.ports[number - 1]
+            await bus.wait_for_async(lambda port=port: port.status == 0x30, 15)
+            assert not port.witness.starts
+            box.press_key(number, 1)
+            await bus.wait_for_async(lambda port=port: port.status == 0x40, 15)
 
         mine = {"entity_id": "number.garage_charging_current", "value": 9}
         await client.post("services/number/set_value", mine)
+        answers: dict[str, Any] = await client.get(AUTOMATION)
+        await client.post(AUTOMATION, answers | {"description": "Mine"})
 
+        capsys.readouterr()
         await home.furnish(client, settings)
+        said = capsys.readouterr().out
+        assert said.count("knows this bus already") == len(BUSES)
+        assert "Loading bay: discovered: knows this box already" in said
         assert round(boxes[0].ic_amps) == 9
+        assert (await client.get(AUTOMATION))["description"] == "Mine"
         entries = hass.config_entries.async_entries(DOMAIN)
         assert len(entries) == len(BUSES)
         assert not hass.config_entries.flow.async_progress()
 
-        assert saved[0] == saved[1]
-        names = [charger.name for bus in saved[0] for charger in bus.chargers]
+        assert shown[0] == shown[1]
+        names = [charger.name for bus in shown[0] for charger in bus.chargers]
         assert sorted(names) == sorted(
             name for bus in BUSES for name in bus.names.values()
         )
-        shown = _entities(dashboard(saved[0]))
+        entities = _entities(dashboard(shown[0]))
         assert {
             f"number.{name}_charging_current"
-            for name in ("garage", "guests", "courtyard", "barn_left")
-        } < shown
-        assert "sensor.courtyard_offered_current" in shown
-        assert any(entity.endswith("_shared_supply") for entity in shown)
-        assert "sensor.car_park_south_module_4_power" in shown
-        assert {entity for entity in shown if hass.states.get(entity) is None} == set()
+            for name in (
+                *("garage", "guests", "courtyard", "barn_left"),
+                *("workshop_port_1", "workshop_port_2", "loading_bay_port_2"),
+            )
+        } < entities
+        assert "sensor.courtyard_offered_current" in entities
+        assert any(entity.endswith("_shared_supply") for entity in entities)
+        assert "sensor.car_park_south_module_4_power" in entities
+        assert "sensor.loading_bay_port_1_last_result" in entities
+        assert {one for one in entities if hass.states.get(one) is None} == set()
+        # It asks for no cards: nothing is there that would be gone at the next start.
+        assert hass.states.get("event.workshop_card") is None
         for entry in entries:
             assert await hass.config_entries.async_unload(entry.entry_id)
+
+
+@pytest.mark.usefixtures("shown")
+async def test_a_box_that_does_not_dial_holds_up_nothing(
+    hass: HomeAssistant,
+    client: Client,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(home, "BOX_PATIENCE", 0.1)
+    monkeypatch.setattr(home, "PATIENCE", 0.1)
+    monkeypatch.setattr(home, "BUSES", [bus for bus in BUSES if bus.dials])
+    await home.furnish(client, _settings(tmp_path))
+    assert "Loading bay: discovered: it is not offered" in capsys.readouterr().out
+    # There is no port to answer for.
+    with pytest.raises(DemoError, match="404"):
+        await client.get(AUTOMATION)
+    [listener] = hass.config_entries.async_entries(DOMAIN)
+    assert not listener.subentries
+    assert await hass.config_entries.async_unload(listener.entry_id)
 
 
 async def test_a_flow_that_cannot_go_on_is_closed(
     hass: HomeAssistant, client: Client, tmp_path: Path
 ) -> None:
     bus = BUSES[0]
-    answers = bus.answers(str(tmp_path / "nothing"))
+    answers = bus.answers(_settings(tmp_path / "nothing"))
     with pytest.raises(DemoError, match="port"):
         await add_entry(client, DOMAIN, answers, lambda _step: None)
     del answers["port"]
@@ -255,121 +333,3 @@ def _alive(pid: int) -> bool:
         return "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text()
     except OSError:
         return False
-
-
-# -- What can be in the way ------------------------------------------------------
-
-
-def test_one_demo_in_one_folder(tmp_path: Path) -> None:
-    settings = _settings(tmp_path / "state")
-    with (
-        alone(settings),
-        pytest.raises(DemoError, match="runs already"),
-        alone(settings),
-    ):
-        pytest.fail("two demos share a folder")
-    with alone(settings):
-        pass
-    # The ports that Home Assistant has stored would not be there.
-    settings.folder.rename(tmp_path / "moved")
-    with (
-        pytest.raises(DemoError, match="made in another place"),
-        alone(_settings(tmp_path / "moved")),
-    ):
-        pytest.fail("a moved folder is used")
-
-
-@pytest.mark.usefixtures("socket_enabled")
-def test_a_taken_port_is_told(tmp_path: Path) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        settings = Settings(folder=tmp_path, port=server.getsockname()[1])
-        with pytest.raises(DemoError, match="is taken by another program"):
-            check_port(settings)
-    check_port(settings)
-
-
-# -- Pure parts ------------------------------------------------------------------
-
-
-def test_a_form_is_filled_in_as_a_person_leaves_it() -> None:
-    fields = [
-        {"name": "typed", "default": 1},
-        {"name": "suggested", "default": 2, "description": {"suggested_value": 3}},
-        {"name": "default", "default": 4},
-        {"name": "empty"},
-        {
-            "name": "more",
-            "type": "expandable",
-            "schema": [{"name": "inner", "default": 5}, {"name": "other"}],
-        },
-    ]
-    assert fill(fields, {"typed": 6, "more": {"other": 7}}) == {
-        "typed": 6,
-        "suggested": 3,
-        "default": 4,
-        "more": {"inner": 5, "other": 7},
-    }
-
-
-def test_listing_leaves_out_what_cannot_be_shown() -> None:
-    def entity(unique_id: str, **more: object) -> dict[str, object]:
-        return {
-            "entity_id": f"sensor.{unique_id.lower()}",
-            "unique_id": unique_id,
-            "platform": DOMAIN,
-            "config_entry_id": "BUS",
-            "config_subentry_id": "ONE",
-            "device_id": "d1",
-            "disabled_by": None,
-        } | more
-
-    devices = [
-        {
-            "id": "d0",
-            "name": "Bus",
-            "name_by_user": None,
-            "identifiers": [[DOMAIN, "BUS"]],
-        },
-        {
-            "id": "d1",
-            "name": "Box",
-            "name_by_user": "Mine",
-            "identifiers": [[DOMAIN, "ONE"]],
-        },
-    ]
-    entities = [
-        entity("BUS_connected", config_subentry_id=None),
-        entity("ONE_charging_current"),
-        entity("ONE_requests", disabled_by="integration"),
-        entity("ONE_2_current_l1"),
-        entity("ONE_1_current_l1"),
-        entity("ONE_power", platform="other"),
-    ]
-    (bus,) = list_buses(entities, devices)
-    assert (bus.name, bus.entities) == ("Bus", {"connected": "sensor.bus_connected"})
-    (charger,) = bus.chargers
-    assert charger.name == "Mine"
-    assert charger.entities == {"charging_current": "sensor.one_charging_current"}
-    assert list(charger.connectors) == [1, 2]
-    assert (
-        charger.connectors[2].find("power", "current_l1") == "sensor.one_2_current_l1"
-    )
-
-
-def test_a_dashboard_of_nothing_has_no_empty_cards() -> None:
-    (view,) = dashboard([])["views"]
-    assert [card["type"] for card in view["sections"][0]["cards"]] == ["heading"]
-
-
-@pytest.mark.parametrize("port", ["0", "65536", "-1", "8123 ", "http", "²"])
-def test_a_port_that_is_none(port: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("EVSE_BUS_DEMO_PORT", port)
-    with pytest.raises(DemoError, match="no TCP port"):
-        from_environment()
-
-
-def test_settings(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("EVSE_BUS_DEMO_PORT", "")
-    monkeypatch.setenv("EVSE_BUS_DEMO_DIR", str(tmp_path))
-    settings = from_environment()
-    assert (settings.url, settings.folder) == ("http://127.0.0.1:8123", tmp_path)

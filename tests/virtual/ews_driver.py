@@ -28,7 +28,7 @@ class Driver:
     port: EwsPort
     seed: int = 0
     hesitates: tuple[float, float] = (1.0, 5.0)
-    patience: float = 60.0
+    patience: float = 30.0
     rng: Random = field(init=False)
     _next: float | None = field(default=None, init=False)
 
