@@ -57,6 +57,8 @@ class DemoBus:
             **line,
             **self.search,
             "charger": self._charger,
+            # The same form, for a charger with ports.
+            "box": self._charger,
             f"confirm_{self.protocol}": {},
         }
 
