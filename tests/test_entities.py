@@ -1,5 +1,9 @@
 """All entities of every protocol as Home Assistant shows them, as snapshots."""
 
+from collections.abc import Mapping
+from contextlib import AbstractAsyncContextManager
+from typing import Any
+
 from homeassistant.const import Platform
 from homeassistant.core import HomeAssistant
 from homeassistant.helpers import device_registry as dr, entity_registry as er
@@ -10,7 +14,8 @@ from custom_components.evse_bus.const import DOMAIN
 from custom_components.evse_bus.evse.protocols import PROTOCOLS
 from custom_components.evse_bus.sensor_counts import BUS_SENSORS, CHARGER_STATISTICS
 from tests.common import call, get_entity, running, wait_for_state, wait_until
-from tests.virtual import AblBox, EvboxChargePoint, SmartEvse
+from tests.ews import listening
+from tests.virtual import AblBox, EvboxChargePoint, EwsBox, SmartEvse
 from tests.virtual.device import Device
 
 # What depends on when one looks, or on what flowed meanwhile.
@@ -19,6 +24,34 @@ UNSTEADY = (
     "missed_deadlines",
 )
 SUPPLY = {"smartevse_master": {"supply_limit": 20.0}}
+READ_BACK = {
+    "abl": ("offered_current",),
+    **dict.fromkeys(("ews", "ews_network"), ("1_offered_current", "2_offered_current")),
+}
+
+
+@pytest.fixture(params=PROTOCOLS)
+def protocol(request: pytest.FixtureRequest) -> str:
+    """Return one protocol after the other; the sockets of those that need some."""
+    key: str = request.param
+    if PROTOCOLS[key].dials_in:
+        request.getfixturevalue("socket_enabled")
+    return key
+
+
+def up(
+    hass: HomeAssistant,
+    protocol: str,
+    device: Device,
+    *,
+    supply: Mapping[str, float] | None = None,
+    **data: object,
+) -> AbstractAsyncContextManager[tuple[Any, Any]]:
+    """Run a bus or a listener with one virtual charger set up."""
+    if PROTOCOLS[protocol].dials_in:
+        assert isinstance(device, EwsBox)
+        return listening(hass, device, **data)
+    return running(hass, device, supply=supply, **data)
 
 
 def boxes(protocol: str) -> tuple[Device, str, str]:
@@ -31,24 +64,26 @@ def boxes(protocol: str) -> tuple[Device, str, str]:
         # Everything that a SmartEVSE can have.
         box = SmartEvse("later", mode=1)
         return box, "select", "setting_mode_at_start"
+    if protocol in ("ews", "ews_network"):
+        # A lock, cards and keys; ventilation has no condition.
+        return EwsBox(rfid=True, manual_io=True), "sensor", "2_energy"
     return SmartEvse(load_balance=2), "number", "setting_maximum_current"
 
 
 @pytest.mark.usefixtures("all_entities_enabled")
-@pytest.mark.parametrize("protocol", PROTOCOLS)
 async def test_entities(
     hass: HomeAssistant, snapshot: SnapshotAssertion, protocol: str
 ) -> None:
     device, platform, last = boxes(protocol)
     supply = SUPPLY.get(protocol)
-    async with running(
-        hass, device, supply=supply, poll_interval=0.5, order_lifetime=60
+    async with up(
+        hass, protocol, device, supply=supply, poll_interval=0.5, order_lifetime=60
     ) as (entry, _):
         entity = await get_entity(hass, platform, entry, last)
         await wait_for_state(hass, entity, lambda state: state.state)
-        if protocol == "abl":
+        for key in READ_BACK.get(protocol, ()):
             # Read back above the order, it is brought down right away.
-            offered = await get_entity(hass, "sensor", entry, "offered_current")
+            offered = await get_entity(hass, "sensor", entry, key)
             await wait_for_state(hass, offered, "6.0")
         await hass.async_block_till_done()
         registry = er.async_get(hass)
@@ -62,22 +97,22 @@ async def test_entities(
 
 
 @pytest.mark.usefixtures("all_entities_enabled")
-@pytest.mark.parametrize("protocol", PROTOCOLS)
 async def test_devices(
     hass: HomeAssistant, snapshot: SnapshotAssertion, protocol: str
 ) -> None:
     device, platform, last = boxes(protocol)
-    async with running(hass, device, poll_interval=0.5) as (entry, _):
+    async with up(hass, protocol, device, poll_interval=0.5) as (entry, _):
         await get_entity(hass, platform, entry, last)
         registry = dr.async_get(hass)
         charger = next(iter(entry.subentries))
         find = registry.async_get_device_by_identifier
         assert find((DOMAIN, "bus"), "bus") == snapshot(name="bus")
         assert find((DOMAIN, charger), "bus") == snapshot(name="charger")
-        child = registry.async_get_child_device_by_identifier(
-            (DOMAIN, f"{charger}_1"), "bus"
-        )
-        assert child == snapshot(name="connector")
+        child = registry.async_get_child_device_by_identifier
+        assert child((DOMAIN, f"{charger}_1"), "bus") == snapshot(name="connector")
+        if PROTOCOLS[protocol].ports > 1:
+            second = child((DOMAIN, f"{charger}_2"), "bus")
+            assert second == snapshot(name="second connector")
 
 
 async def test_only_what_a_charger_has(hass: HomeAssistant) -> None:
