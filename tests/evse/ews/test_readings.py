@@ -128,7 +128,7 @@ def test_cards_and_keys_are_there_as_the_parameters_say(
 
 
 def test_before_the_parameters_are_known() -> None:
-    """What may turn out not to be there is not shown, since it would stay."""
+    """What may turn out not to be there is not promised."""
     known = capabilities_of(2, None)
     assert known >= ALWAYS
     assert not known & (MODE_3 | {Capability.CARDS, Capability.KEYS})
