@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
+from copy import deepcopy
 from typing import Any
 
 from homeassistant.config_entries import (
@@ -156,6 +157,17 @@ async def running(
             if entry.state is ConfigEntryState.LOADED:
                 await hass.config_entries.async_unload(entry.entry_id)
                 await hass.async_block_till_done()
+
+
+async def crash(
+    hass: HomeAssistant, entry: MockConfigEntry, storage: dict[str, Any]
+) -> None:
+    """End a bus as a killed process does: nothing more is sent or written."""
+    key = f"{DOMAIN}.{entry.entry_id}"
+    on_disk = deepcopy(storage.get(key))
+    await hass.config_entries.async_unload(entry.entry_id)
+    await hass.async_block_till_done()
+    storage[key] = on_disk
 
 
 async def call(

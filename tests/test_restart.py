@@ -1,7 +1,6 @@
 """Stops, crashes and starts: the orders on disk are what the wire hears first."""
 
 import asyncio
-from copy import deepcopy
 from datetime import timedelta
 import logging
 from pathlib import Path
@@ -23,6 +22,7 @@ from tests.common import (
     call,
     charger,
     charger_of,
+    crash,
     get_entity,
     running,
     setup_bus,
@@ -40,14 +40,6 @@ from tests.virtual import (
 )
 
 STORE = "evse_bus.bus"
-
-
-async def crash(hass: HomeAssistant, entry: Any, storage: dict[str, Any]) -> None:  # noqa: ANN401 - a mock's entry
-    """End a bus as a killed process does: nothing more is sent or written."""
-    on_disk = deepcopy(storage.get(STORE))
-    await hass.config_entries.async_unload(entry.entry_id)
-    await hass.async_block_till_done()
-    storage[STORE] = on_disk
 
 
 async def test_orders_are_read_before_the_port_is_opened(hass: HomeAssistant) -> None:

@@ -262,7 +262,8 @@ class EwsReader(Charger):
         if box.status is not None and (self.info is None or self._is_news(box.serial)):
             self.info = charger_info(box.status)
         if (told := box.told) is not None:
-            paused = self.permission.is_paused(seen)
+            known = self.permission.paused
+            paused = None if known is None else self.permission.is_paused(seen)
             self.reading = charger_reading(self.port, told, paused=paused)
         if self.told != self.last_told:
             self.updated()

@@ -11,7 +11,14 @@ from ..readings import ChargerInfo, ChargerReading, ConnectorReading
 from .box import BoxStatus
 from .parameters import SystemMode
 from .session import Installation, Told
-from .states import CHARGING, PAUSED_OPTIMISED, WAITING, box_faults, port_state
+from .states import (
+    AFTER_OUR_PAUSE,
+    CHARGING,
+    PAUSED_OPTIMISED,
+    WAITING,
+    box_faults,
+    port_state,
+)
 from .status import ChargeResult, PortFlags, PortStatus, StartRelease
 
 MODE_1_CURRENT: Final = 16
@@ -115,14 +122,15 @@ def charger_info(box: BoxStatus) -> ChargerInfo:
     )
 
 
-def charger_reading(port: int, box: Told, *, paused: bool) -> ChargerReading:
-    """Return a port's reading; ``paused``: it is our pause that it is in.
+def charger_reading(port: int, box: Told, *, paused: bool | None) -> ChargerReading:
+    """Return a port's reading; ``paused``: it is our pause that it is in, or may be.
 
     Its connector has the number of the port: both are parts of one box.
     """
     at = port - 1
     seen, details, installation = box.ports[at], box.details, box.installation
-    state = port_state(seen, fixed_cable=installation.fixed_cable, paused=paused)
+    fixed = installation.fixed_cable
+    state = port_state(seen, fixed_cable=fixed, paused=paused is True)
     connector = ConnectorReading(
         status=state.status,
         raw_state=state.raw,
@@ -183,10 +191,15 @@ def _result(told: ChargeResult | None) -> SessionResult | None:
     return None if told is None else SessionResult[told.name]
 
 
-def _allowed(seen: PortStatus, *, paused: bool) -> bool | None:
-    """Return whether a car may charge, as the box says it."""
+def _allowed(seen: PortStatus, *, paused: bool | None) -> bool | None:
+    """Return whether a car may charge, as the box says it; ``None``: it does not.
+
+    The same word of the box is for a pause of the car and for one of ours.
+    """
     if paused:
         return False
+    if paused is None and seen.status in AFTER_OUR_PAUSE:
+        return None
     if seen.status in RUNNING:
         return True
     if seen.status == WAITING:
