@@ -34,27 +34,25 @@ _MODE_3_ONLY: Final = frozenset(
         Capability.PILOT_VOLTAGE,
     }
 )
-_ALWAYS: Final = frozenset(
-    {
-        Capability.STATUS,
-        Capability.RAW_STATE,
-        Capability.PLUGGED,
-        Capability.CHARGING,
-        Capability.POWER,
-        Capability.ENERGY,
-        Capability.MAXIMUM_CURRENT,
-        Capability.FAULTS,
-        Capability.RESET,
-        Capability.SESSION,
-        Capability.CONTACTOR,
-        Capability.OPTIMISED,
-        Capability.START_REQUEST,
-        Capability.RCD,
-        Capability.VENTILATION,
-        Capability.SERVER,
-    }
-)
-_ALL: Final = _ALWAYS | _MODE_3_ONLY | {Capability.CARDS}
+_ALL: Final = _MODE_3_ONLY | {
+    Capability.STATUS,
+    Capability.RAW_STATE,
+    Capability.PLUGGED,
+    Capability.CHARGING,
+    Capability.POWER,
+    Capability.ENERGY,
+    Capability.MAXIMUM_CURRENT,
+    Capability.FAULTS,
+    Capability.RESET,
+    Capability.SESSION,
+    Capability.CONTACTOR,
+    Capability.OPTIMISED,
+    Capability.START_REQUEST,
+    Capability.RCD,
+    Capability.VENTILATION,
+    Capability.CARDS,
+    Capability.SERVER,
+}
 
 
 def capabilities_of(
@@ -63,10 +61,11 @@ def capabilities_of(
     """Return what a port has; mode 1 has no pilot, a fixed cable no lock.
 
     Cards are there unless the box says that it asks for none; its keys are told only
-    where they are the server's to watch (3.2.3). ``None``: only what every one has.
+    where they are the server's to watch (3.2.3). What its parameters may take away is
+    left out before they are known: what was shown once would stay.
     """
     if installation is None:
-        return _ALWAYS
+        return _ALL - _MODE_3_ONLY - {Capability.CARDS}
     known = set(_ALL)
     if installation.mode_1[port - 1]:
         known -= _MODE_3_ONLY
