@@ -121,9 +121,11 @@ def charger_of(device: Device, **data: object) -> ConfigSubentryDataWithId:
     return charger("evbox", number, serial=str(number), **data)
 
 
-def ews_charger(box: EwsBox, **data: object) -> ConfigSubentryDataWithId:
+def ews_charger(
+    box: EwsBox, *, title: str = "Yard", **data: object
+) -> ConfigSubentryDataWithId:
     """Return the subentry of a virtual EWS-Box; its ports are chargers of their own."""
-    made = charger("ews", box.serial, serial=box.serial, title="Yard", **data)
+    made = charger("ews", box.serial, serial=box.serial, title=title, **data)
     return {**made, "subentry_id": f"ews{box.serial[-2:]}"}
 
 

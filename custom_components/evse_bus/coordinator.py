@@ -193,7 +193,8 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
             await self.orders.async_commit(key, orders)
         charger = self.protocol.charger(config, orders)
         part = config.address if self.protocol.ports > 1 else None
-        unit = ChargerUnit(subentry, charger, await self.lines.join(config), part)
+        bus = await self.lines.join(config, subentry.title)
+        unit = ChargerUnit(subentry, charger, bus, part)
         self.units[key] = unit
         self.devices.show_charger(unit)
         if lost:
@@ -249,7 +250,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         await self.lines.leave(unit.bus)
         self.issues.forget(unit)
         unit.charger = self.protocol.charger(config, old.orders)
-        unit.bus = await self.lines.join(config)
+        unit.bus = await self.lines.join(config, subentry.title)
         self.devices.show_charger(unit)
         self._connect(unit)
         self._on_charger(unit)

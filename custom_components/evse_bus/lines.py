@@ -51,8 +51,11 @@ class Lines(ABC):
         """Close them and leave nothing behind."""
 
     @abstractmethod
-    async def join(self, config: ChargerConfig) -> Bus:
-        """Return the bus of a charger, which is then to be put on it."""
+    async def join(self, config: ChargerConfig, name: str) -> Bus:
+        """Return the bus of a charger, which is then to be put on it.
+
+        ``name``: of its box, for messages.
+        """
 
     async def leave(self, bus: Bus) -> None:  # noqa: B027 - a port keeps its bus
         """Take note that a charger was taken off a bus."""
@@ -91,7 +94,7 @@ class PortLines(Lines):
         await self._bus.stop()
 
     @override
-    async def join(self, config: ChargerConfig) -> Bus:
+    async def join(self, config: ChargerConfig, name: str) -> Bus:
         return self._bus
 
     @override
@@ -141,9 +144,9 @@ class ListenerLines(Lines):
         await asyncio.gather(*(self._forget(serial) for serial in tuple(self._buses)))
 
     @override
-    async def join(self, config: ChargerConfig) -> Bus:
+    async def join(self, config: ChargerConfig, name: str) -> Bus:
         serial = config.serial or ""
-        bus = self._buses[serial] = self.listener.expect(serial, config.name)
+        bus = self._buses[serial] = self.listener.expect(serial, name)
         if self._started:
             await bus.start()
         return bus

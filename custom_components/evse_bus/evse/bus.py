@@ -37,6 +37,12 @@ REOPEN_FIRST: Final = 1.0
 """First pause before a lost port is opened again, s; doubles."""
 REOPEN_LIMIT: Final = 30.0
 """Longest such pause, s."""
+_LOST: Final = {
+    False: "%s: the port was lost (%s), trying again",
+    True: "%s: the connection was lost (%s), waiting for another",
+}
+_BACK: Final = {False: "%s: the port is back", True: "%s: connected again"}
+"""By whether the other end opens the line."""
 STOP_PATIENCE: Final = 6.0
 """Longest time a stop waits for a conversation begun (waking a car: 3 s), s."""
 
@@ -399,7 +405,8 @@ class Bus(Observed):
         self.updated()
 
     def _on_lost(self, error: LineLostError) -> None:
-        _LOGGER.warning("%s: the port was lost (%s), trying again", self.name, error)
+        lost = _LOST[self.line.opened_by_peer]
+        _LOGGER.warning(lost, self.name, error)
         self.connected = False
         self.wire.fail(error)
         self._jobs.fail_all(error)
@@ -435,7 +442,7 @@ class Bus(Observed):
                 pause = min(pause * 2, REOPEN_LIMIT)
                 continue
             if self._was_open:
-                _LOGGER.warning("%s: the port is back", self.name)
+                _LOGGER.warning(_BACK[self.line.opened_by_peer], self.name)
                 self.wire.statistics.reopened += 1
             self._on_open()
             return True

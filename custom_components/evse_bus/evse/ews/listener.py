@@ -164,12 +164,12 @@ class Listener:
         """Return the bus of a box; it waits until the box dials.
 
         Put ports on it and start it. One that has dialled already as a stranger
-        begins at once.
+        begins at once. ``name`` is what the log calls it.
         """
         if (known := self._buses.get(serial)) is not None:
             return known
         framer = EwsFramer()
-        line = AcceptedLine(f"EWS-Box {serial}", lambda: framer.noise)
+        line = AcceptedLine(name or f"EWS-Box {serial}", lambda: framer.noise)
         bus = self._buses[serial] = Bus(line, framer, TCP_TIMING, name)
         if (stranger := self._strangers.pop(serial, None)) is not None:
             self._keep_for_good(stranger)
@@ -246,7 +246,7 @@ class Listener:
             async with asyncio.timeout(IDENTIFY_TIME):
                 stranger = await _identify(connection)
         except (TimeoutError, EvseError) as error:
-            _LOGGER.debug("%s did not say who it is: %s", connection.peer, error)
+            _LOGGER.debug("Somebody did not say who it is: %s", error)
             self.statistics.unidentified += 1
             connection.abort()
             return
@@ -282,7 +282,7 @@ class Listener:
         if not isinstance(line, AcceptedLine) or not line.is_open:
             return True
         if serial in self._asking:
-            self._refuse(stranger, connection)
+            self._refuse(stranger, bus, connection)
             return False
         self._asking.add(serial)
         try:
@@ -291,19 +291,20 @@ class Listener:
         finally:
             self._asking.discard(serial)
         if alive:
-            self._refuse(stranger, connection)
+            self._refuse(stranger, bus, connection)
             return False
         self.statistics.replaced += 1
         line.end("another connection has its number, and this one does not answer")
         return connection.is_open
 
-    def _refuse(self, stranger: Stranger, connection: Connection) -> None:
+    def _refuse(self, stranger: Stranger, bus: Bus, connection: Connection) -> None:
         self.statistics.seconds += 1
         connection.abort()
-        message = "%s says that it is EWS-Box %s, which is connected and answers"
-        level = logging.DEBUG if stranger.serial in self._warned else logging.WARNING
+        if stranger.serial in self._warned:
+            return
         self._warned.add(stranger.serial)
-        _LOGGER.log(level, message, stranger.peer, stranger.serial)
+        message = "%s says that it is %s, which is connected and answers"
+        _LOGGER.warning(message, stranger.peer, bus.name)
 
     def _bind(self, serial: str, bus: Bus, connection: Connection) -> None:
         if self._buses.get(serial) is not bus or not isinstance(bus.line, AcceptedLine):
@@ -318,7 +319,7 @@ class Listener:
 async def _identify(connection: Connection) -> Stranger:
     """Ask ``id`` and ``rs``; raises EvseError when that comes to nothing."""
     framer = EwsFramer()
-    line = AcceptedLine(f"{connection.peer}", lambda: framer.noise)
+    line = AcceptedLine("somebody", lambda: framer.noise)
     wire = Wire(line, framer, TCP_TIMING)
     line.on_lost = wire.fail
     early: list[bytes] = []

@@ -210,7 +210,7 @@ class EwsReader(Charger):
             if self.bus is not None and isinstance(self.bus.line, AcceptedLine):
                 # It would keep out the one whose number it gave when it dialled.
                 self.bus.line.end("another box answers")
-            message = f"{self.config.name}: {found} answers, not {expected}"
+            message = f"{self.config.name}: another box answers"
             raise WrongChargerError(message, expected=expected, found=found)
 
     def hold_back(self) -> None:
