@@ -71,6 +71,23 @@ def test_ports_differ() -> None:
     assert len(keys) == len(kinds)
 
 
+def test_an_address_to_listen_on_has_words_of_its_own() -> None:
+    kinds = (
+        library.PortMissingError,
+        library.PortBusyError,
+        library.PortPermissionError,
+        library.LineError,
+    )
+    errors = [not_ready(kind("why"), "::1", listens=True) for kind in kinds]
+    keys = [error.translation_key for error in errors]
+    assert keys == [
+        f"listen_{one}" for one in ("missing", "busy", "permission", "failed")
+    ]
+    for error in errors:
+        text = english()["exceptions"][error.translation_key]["message"]
+        assert "::1" in text.format(**error.translation_placeholders)
+
+
 async def test_a_platform_that_fails_does_not_keep_the_port(
     hass: HomeAssistant,
 ) -> None:

@@ -18,6 +18,7 @@ from custom_components.evse_bus import (
 )
 from custom_components.evse_bus.errors import (
     _COMMAND_KEYS,
+    _LISTEN_KEYS,
     _PORT_KEYS,
     EWS_KEYS,
     ActionError,
@@ -108,7 +109,7 @@ def test_icons_belong_to_entities(platform: str) -> None:
 
 def test_errors_have_texts() -> None:
     texts = english()["exceptions"]
-    keys = {key for _, key in (*_PORT_KEYS, *_COMMAND_KEYS)}
+    keys = {key for _, key in (*_PORT_KEYS, *_LISTEN_KEYS, *_COMMAND_KEYS)}
     assert keys | set(EWS_KEYS.values()) | set(ActionError) == texts.keys()
     placeholders = dict.fromkeys(("charger", "port", "error", "expected", "found"), "x")
     for key in keys:

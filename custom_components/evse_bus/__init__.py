@@ -61,7 +61,8 @@ async def async_setup_entry(hass: HomeAssistant, entry: EvseBusConfigEntry) -> b
         await hass.config_entries.async_forward_entry_setups(entry, PLATFORMS)
     except LineError as error:
         await coordinator.async_stop()
-        raise not_ready(error, coordinator.port) from error
+        listens = coordinator.bus is None
+        raise not_ready(error, coordinator.port, listens=listens) from error
     except BaseException:
         # A bus left running would hold the port against the next try.
         await coordinator.async_stop()

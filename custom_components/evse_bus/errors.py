@@ -44,6 +44,12 @@ _PORT_KEYS: Final[tuple[tuple[type[LineError], str], ...]] = (
     (PortSettingsError, "port_settings"),
     (LineError, "port_failed"),
 )
+_LISTEN_KEYS: Final[tuple[tuple[type[LineError], str], ...]] = (
+    (PortMissingError, "listen_missing"),
+    (PortBusyError, "listen_busy"),
+    (PortPermissionError, "listen_permission"),
+    (LineError, "listen_failed"),
+)
 
 _COMMAND_KEYS: Final[tuple[tuple[type[EvseError], str], ...]] = (
     (HiddenSecretError, "ews_secret_hidden"),
@@ -117,16 +123,17 @@ def _as_texts(placeholders: Mapping[str, object]) -> dict[str, str]:
     return {name: str(value) for name, value in placeholders.items()}
 
 
-def port_error_key(error: LineError) -> str:
-    """Return the translation key that says why a port cannot be used."""
-    return next(key for kind, key in _PORT_KEYS if isinstance(error, kind))
+def not_ready(
+    error: LineError, port: str, *, listens: bool = False
+) -> ConfigEntryNotReady:
+    """Return why a bus cannot be set up now; Home Assistant tries again later.
 
-
-def not_ready(error: LineError, port: str) -> ConfigEntryNotReady:
-    """Return why a bus cannot be set up now; Home Assistant tries again later."""
+    ``listens``: the port is one that boxes are to dial.
+    """
+    keys = _LISTEN_KEYS if listens else _PORT_KEYS
     return ConfigEntryNotReady(
         translation_domain=DOMAIN,
-        translation_key=port_error_key(error),
+        translation_key=next(key for kind, key in keys if isinstance(error, kind)),
         translation_placeholders={"port": port, "error": str(error)},
     )
 
