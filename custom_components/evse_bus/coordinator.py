@@ -263,6 +263,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         del self.units[unit.key]
         self.devices.forget_port(unit)
         self.issues.forget(unit)
+        self._notify(BUS)
 
     # -- What a charger tells ----------------------------------------------------
 
