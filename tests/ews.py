@@ -2,11 +2,13 @@
 
 from collections.abc import AsyncIterator, Sequence
 from contextlib import ExitStack, asynccontextmanager
+import logging
 import socket
 from typing import Any
 
 from homeassistant.config_entries import ConfigEntryState, ConfigSubentryData
 from homeassistant.core import HomeAssistant
+import pytest
 from pytest_homeassistant_custom_component.common import MockConfigEntry
 
 from custom_components.evse_bus.const import DOMAIN
@@ -82,6 +84,17 @@ async def polled(bus: VirtualBus, box: EwsBox, times: int = 5) -> None:
 
 
 # -- Boxes that dial us ----------------------------------------------------------
+
+BOXES = "sensor.bus_connected_boxes"
+
+
+def said(caplog: pytest.LogCaptureFixture, words: str) -> int:
+    """Return how often we have said something that a user sees."""
+    return sum(
+        words in record.getMessage()
+        for record in caplog.records
+        if record.levelno >= logging.WARNING and DOMAIN in record.name
+    )
 
 
 def free_port() -> int:

@@ -2,10 +2,15 @@
 
 from homeassistant.config_entries import ConfigEntry
 from homeassistant.core import HomeAssistant
-from homeassistant.helpers import device_registry as dr, entity_registry as er
+from homeassistant.helpers import (
+    device_registry as dr,
+    entity_registry as er,
+    issue_registry as ir,
+)
 
 from custom_components.evse_bus import async_remove_config_entry_device
 from custom_components.evse_bus.const import DOMAIN
+from custom_components.evse_bus.coordinator import BUS
 from tests.common import (
     call,
     entity_id,
@@ -134,11 +139,13 @@ async def test_a_second_port_comes_and_goes(hass: HomeAssistant) -> None:
         await polled(bus, box)
         assert (state_of(hass, status), state_of(hass, one)) == ("charging", "on")
         assert bus.opened == opened
+        assert not ir.async_get(hass).issues
         # A port that comes back begins with the fail-safe current.
         use_ports(hass, entry, 2)
         two = await get_entity(hass, "number", entry, "2_charging_current")
         await wait_for_state(hass, two, "6.0")
         await bus.wait_for_async(lambda: box.ports[1].limit == 6)
+        assert not ir.async_get(hass).issues
 
 
 async def test_a_port_that_is_used_cannot_be_deleted(hass: HomeAssistant) -> None:
@@ -173,3 +180,27 @@ async def test_a_box_that_is_removed(hass: HomeAssistant) -> None:
         # It is not stopped: it was only taken off.
         assert box.ports[0].contactor
         assert len(box.writes) == told
+
+
+async def test_a_port_that_charges_costs_its_own_entities(
+    hass: HomeAssistant,
+) -> None:
+    """Of what one port tells the entities of the other hear nothing."""
+    box = EwsBox(cars=(quick_car(), None))
+    async with running(hass, box) as (entry, bus):
+        await get_entity(hass, "sensor", entry, "2_status")
+        await bus.wait_for_async(lambda: box.ports[1].limit == 6)
+        await polled(bus, box)
+        await hass.async_block_till_done()
+        coordinator = entry.runtime_data
+        called: set[str] = set()
+        for key, context in {
+            "bus": BUS,
+            "one": ("ews01_1", 1),
+            "two": ("ews01_2", None),
+            "two, connector": ("ews01_2", 2),
+        }.items():
+            coordinator.async_add_listener(lambda key=key: called.add(key), context)
+        await charge(hass, entry, bus, box)
+        await polled(bus, box)
+        assert called == {"one"}

@@ -29,10 +29,12 @@ from tests.common import (
     state_of,
     wait_for_state,
 )
+from tests.ews import listening
 from tests.virtual import (
     AblBox,
     Car,
     EvboxChargePoint,
+    EwsBox,
     Module,
     SmartEvse,
     VirtualBus,
@@ -194,6 +196,18 @@ async def test_disabled_and_enabled_again(hass: HomeAssistant) -> None:
         await wait_for_state(hass, limit, "12.0")
 
 
+def complaints(caplog: pytest.LogCaptureFixture) -> list[str]:
+    """Return the warnings and errors that are about us."""
+    return [
+        record.getMessage()
+        for record in caplog.records
+        if record.levelno >= logging.WARNING
+        and (DOMAIN in record.name or DOMAIN in record.getMessage())
+        # Said of every custom integration.
+        and "has not been tested by Home Assistant" not in record.getMessage()
+    ]
+
+
 async def test_nothing_to_complain_about(
     hass: HomeAssistant, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -203,23 +217,33 @@ async def test_nothing_to_complain_about(
         EvboxChargePoint(1923054, 2, min_interval=0),
         SmartEvse(),
         SmartEvse(load_balance=2),
+        EwsBox(rfid=True, manual_io=True),
     ):
         async with running(hass, box, poll_interval=0.3) as (entry, _):
             await get_entity(hass, "binary_sensor", entry, "1_charging")
+            await hass.async_block_till_done()
             await hass.config_entries.async_reload(entry.entry_id)
             await hass.async_block_till_done()
             await get_entity(hass, "binary_sensor", entry, "1_charging")
         await hass.config_entries.async_remove(entry.entry_id)
         await hass.async_block_till_done()
-    complaints = [
-        record.getMessage()
-        for record in caplog.records
-        if record.levelno >= logging.WARNING
-        and (DOMAIN in record.name or DOMAIN in record.getMessage())
-        # Said of every custom integration.
-        and "has not been tested by Home Assistant" not in record.getMessage()
-    ]
-    assert not complaints
+    assert not complaints(caplog)
+
+
+@pytest.mark.usefixtures("socket_enabled")
+async def test_nothing_to_complain_about_of_a_listener(
+    hass: HomeAssistant, caplog: pytest.LogCaptureFixture
+) -> None:
+    box = EwsBox(rfid=True, manual_io=True)
+    async with listening(hass, box) as (entry, _):
+        await get_entity(hass, "binary_sensor", entry, "2_charging")
+        await hass.async_block_till_done()
+        await hass.config_entries.async_reload(entry.entry_id)
+        await get_entity(hass, "binary_sensor", entry, "2_charging")
+        await hass.async_block_till_done()
+        await hass.config_entries.async_remove(entry.entry_id)
+        await hass.async_block_till_done()
+    assert not complaints(caplog)
 
 
 async def test_ids_never_contain_the_port_or_an_address(hass: HomeAssistant) -> None:
