@@ -2,6 +2,7 @@
 
 import json
 import logging
+import socket
 from typing import Any
 
 from homeassistant.core import HomeAssistant
@@ -15,7 +16,13 @@ from custom_components.evse_bus.diagnostics import (
     async_get_config_entry_diagnostics,
     async_get_device_diagnostics,
 )
-from tests.common import call, get_entity, running, wait_for_state
+from custom_components.evse_bus.evse.ews import accepted
+from tests.common import (
+    call,
+    get_entity,
+    running,
+    wait_for_state,
+)
 from tests.ews import HOST, charge, listening, plug_in, polled, quick_car
 from tests.virtual import EwsBox, EwsCard, VirtualBus
 
@@ -195,16 +202,31 @@ async def test_each_device_tells_of_itself(hass: HomeAssistant) -> None:
 
 @pytest.mark.usefixtures("socket_enabled")
 async def test_nothing_private_over_the_network(
-    hass: HomeAssistant, caplog: pytest.LogCaptureFixture
+    hass: HomeAssistant,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
+    monkeypatch.setattr(accepted, "ANSWER_PATIENCE", 1.0)
     caplog.set_level(logging.DEBUG)
     box = private_box()
     async with listening(
         hass, box, allowed=("127.0.0.0/8",), title="Box of the Millers"
     ) as (entry, (dialler,)):
         await live(hass, entry, dialler, box)
-        dialler.hang_up()
+        # One connection ends, one dies, and somebody does not say who he is.
         status = await get_entity(hass, "sensor", entry, "1_status")
+        dialler.hang_up(redial=False)
+        await wait_for_state(hass, status, "unavailable")
+        dialler.dial()
+        await wait_for_state(hass, status, "charging")
+        dialler.vanish(redial=False)
+        await wait_for_state(hass, status, "unavailable")
+        with socket.create_connection((HOST, entry.data["port"])) as nobody:
+            nobody.sendall(b"x" * 10_000)
+            statistics = entry.runtime_data.lines.listener.statistics
+            await dialler.wait_for_async(lambda: statistics.unidentified)
+        assert "did not say who it is" in caplog.text
+        dialler.dial()
         await wait_for_state(hass, status, "charging")
         await polled(dialler, box)
         told = {

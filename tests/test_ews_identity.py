@@ -1,6 +1,7 @@
 """Another EWS-Box, or one with fewer ports, behind what was set up."""
 
 from dataclasses import replace
+import logging
 from typing import TYPE_CHECKING
 
 from homeassistant.core import HomeAssistant
@@ -48,8 +49,11 @@ def issue(hass: HomeAssistant, key: str) -> ir.IssueEntry | None:
 
 
 async def test_another_box_is_told_nothing(
-    hass: HomeAssistant, monkeypatch: pytest.MonkeyPatch
+    hass: HomeAssistant,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
+    caplog.set_level(logging.DEBUG)
     quick = replace(EwsReader.timing, backoff=0.3, backoff_limit=0.3)
     monkeypatch.setattr(EwsReader, "timing", quick)
     box = EwsBox(serial=OTHER, cars=(quick_car(),))
@@ -60,6 +64,8 @@ async def test_another_box_is_told_nothing(
         fault = entity_id(hass, "sensor", entry, "1_fault") or ""
         assert state_of(hass, fault) == "wrong_charger"
         # Of a box with two ports, once.
+        other = entity_id(hass, "sensor", entry, "2_fault") or ""
+        await wait_for_state(hass, other, "wrong_charger")
         found = issue(hass, "wrong_charger_ews01_1")
         assert found is not None
         assert found.translation_placeholders is not None
@@ -80,6 +86,9 @@ async def test_another_box_is_told_nothing(
             lambda: box.ports[0].limit == box.ports[1].limit == 6, timeout=20
         )
         await hass.config_entries.async_unload(entry.entry_id)
+    ours = [one.getMessage() for one in caplog.records if DOMAIN in one.name]
+    assert any("another box answers" in one for one in ours)
+    assert not any(SERIAL in one or OTHER in one for one in ours)
 
 
 async def test_a_box_that_is_swapped_while_it_charges(hass: HomeAssistant) -> None:
