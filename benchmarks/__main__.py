@@ -10,6 +10,8 @@ from typing import Final
 from . import (
     abl_scan,
     evbox_bus,
+    ews_events,
+    ews_poll,
     exchange_cpu,
     home_assistant,
     set_value,
@@ -30,6 +32,8 @@ BENCHMARKS: Final = {
         home_assistant,
         smartevse_master,
         smartevse_polled,
+        ews_poll,
+        ews_events,
     )
 }
 

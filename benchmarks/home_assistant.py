@@ -63,7 +63,7 @@ async def _measure(house: House, seconds: float) -> dict[str, Any]:
 def _abl(witness: Witness) -> dict[str, Any]:
     return {
         "protocol": "abl",
-        "url": witness.url,
+        "device": witness.url,
         "chargers": [
             {
                 "address": one,
@@ -81,7 +81,7 @@ def _abl(witness: Witness) -> dict[str, Any]:
 def _evbox(witness: Witness) -> dict[str, Any]:
     return {
         "protocol": "evbox",
-        "url": witness.url,
+        "device": witness.url,
         "chargers": [
             {
                 "address": one,

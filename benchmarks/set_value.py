@@ -50,7 +50,7 @@ async def run(*, quick: bool) -> list[Figure]:
         await house.do(
             "add",
             protocol="abl",
-            url=witness.url,
+            device=witness.url,
             chargers=[
                 {
                     "address": one,

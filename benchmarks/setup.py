@@ -8,6 +8,7 @@ from custom_components.evse_bus.evse.abl import PROTOCOL as ABL, AblConfig
 from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.charger import Charger
 from custom_components.evse_bus.evse.evbox import PROTOCOL as EVBOX, EvboxConfig
+from custom_components.evse_bus.evse.ews import PROTOCOL as EWS, EwsPortConfig
 from custom_components.evse_bus.evse.framing import LineSettings
 from custom_components.evse_bus.evse.model import (
     CurrentLimit,
@@ -26,6 +27,7 @@ from .witness import Heard
 ABL_LIMIT: Final = 16.0
 EVBOX_LIMIT: Final = 320.0
 """A for a ChargePoint of 20 modules."""
+EWS_LIMIT: Final = 16.0
 SMARTEVSE_LIMIT: Final = 16.0
 SETTLED_AFTER: Final = 1.5
 """So long without a time-out means that all boxes have been found out about, s."""
@@ -74,6 +76,21 @@ def evbox_bus(url: str, serials: Iterable[int], *, period: float, timeout: int) 
         limit = CurrentLimit(current=EVBOX_LIMIT)
         orders = Orders(limit=limit, fail_safe=limit, fail_safe_timeout=timeout)
         bus.add(EVBOX.charger(config, orders))
+    return bus
+
+
+def ews_bus(url: str, ports: Iterable[int], *, poll_interval: float) -> Bus:
+    """Return the bus of an EWS-Box, with so many of its ports."""
+    bus = EWS.bus(url)
+    for port in ports:
+        config = EwsPortConfig(
+            key=f"ews-{port}",
+            name=f"EWS-Box {port}",
+            address=port,
+            installation_limit=EWS_LIMIT,
+            poll_interval=poll_interval,
+        )
+        bus.add(EWS.charger(config, Orders(limit=CurrentLimit(current=EWS_LIMIT))))
     return bus
 
 

@@ -1,9 +1,10 @@
 """The virtual bus in a process of its own, and its log as the witness.
 
 As a program: ``python -m benchmarks.witness SPEC`` (JSON) puts virtual chargers on a
-pty, prints its path, and then does what it reads from stdin until that ends. As a
-module: `Witness` starts such a process. Both ends use CLOCK_MONOTONIC, which is
-one clock for the whole machine, so times of the log can be compared with ours.
+pty (or lets them dial an address), prints its path, and then does what it reads from
+stdin until that ends. As a module: `Witness` starts such a process. Both ends use
+CLOCK_MONOTONIC, which is one clock for the whole machine, so times of the log can be
+compared with ours.
 """
 
 import asyncio
@@ -16,6 +17,7 @@ from typing import Any, Final, Self
 from tests.virtual import CLIENT, AblBox, Car, EvboxChargePoint, Module, VirtualBus
 from tests.virtual.device import Device
 
+from .ews_boxes import Buses, asked, buses_of, dialling, ews_boxes, touch
 from .machine import ROOT
 from .offers import Offer, offers_of, smartevse_boxes
 
@@ -40,7 +42,7 @@ class Witness:
     """A virtual bus in another process."""
 
     def __init__(self, protocol: str, **options: object) -> None:
-        """Say who is on the bus (see `_MAKERS`)."""
+        """Say who is on the bus (see `_MAKERS`); ``dial``: HOST:PORT that they dial."""
         self._spec = json.dumps({"protocol": protocol, **options})
         self._process: asyncio.subprocess.Process | None = None
         self.url = ""
@@ -95,6 +97,23 @@ class Witness:
     async def kill(self, names: Sequence[str]) -> None:
         """Let these devices fall silent."""
         await self._ask({"kill": list(names)})
+
+    async def touch(self, name: str, what: str, port: int, *values: int) -> float:
+        """Do something to an EWS-Box (see `ews_boxes.touch`); return when."""
+        return float(await self._ask({"touch": [name, what, port, *values]}))
+
+    async def asked(self, since: float) -> dict[str, list[tuple[float, str]]]:
+        """Return what each EWS-Box has been asked from then on, and when."""
+        entries: dict[str, Any] = await self._ask({"asked": since})
+        return {name: [(at, what) for at, what in one] for name, one in entries.items()}
+
+    async def unplug(self) -> None:
+        """Pull the adapter, or all network cables."""
+        await self._ask({"unplug": True})
+
+    async def replug(self) -> None:
+        """Put it, or all of them, back."""
+        await self._ask({"replug": True})
 
     async def _ask(self, command: dict[str, object]) -> Any:  # noqa: ANN401 - JSON
         process = self._process
@@ -151,23 +170,31 @@ def _evbox(*, serials: Sequence[int], modules: int) -> list[Device]:
 _MAKERS: Final[dict[str, Callable[..., list[Device]]]] = {
     "abl": _abl,
     "evbox": _evbox,
+    "ews": ews_boxes,
     "smartevse": smartevse_boxes,
 }
 
 
-def _do(bus: VirtualBus, command: dict[str, Any]) -> object:
-    if "kill" in command:
-        for device in bus.devices:
-            if device.name in command["kill"]:
-                device.faults.dead = True
-        return None
-    if "stats" in command:
-        return bus.stats()
-    if "offers" in command:
-        offers = bus.call(lambda: offers_of(bus.devices))
-        return [(one.at, one.name, one.amps, one.closed) for one in offers]
-    since = command["log"]
-    heard = [*bus.log.bursts(CLIENT), *(e for e in bus.log if e.source != CLIENT)]
+def _kill(bus: Buses, names: Sequence[str]) -> None:
+    for device in bus.devices:
+        if device.name in names:
+            device.faults.dead = True
+
+
+def _offers(bus: Buses) -> object:
+    offers = bus.call(lambda: offers_of(bus.devices))
+    return [(one.at, one.name, one.amps, one.closed) for one in offers]
+
+
+def _log(bus: Buses, since: float) -> object:
+    heard = [
+        entry
+        for one in buses_of(bus)
+        for entry in (
+            *one.log.bursts(CLIENT),
+            *(each for each in one.log if each.source != CLIENT),
+        )
+    ]
     heard.sort(key=lambda entry: entry.t)
     return [
         (
@@ -182,14 +209,28 @@ def _do(bus: VirtualBus, command: dict[str, Any]) -> object:
     ]
 
 
+_COMMANDS: Final[dict[str, Callable[[Buses, Any], object]]] = {
+    "asked": asked,
+    "kill": _kill,
+    "log": _log,
+    "offers": lambda bus, _: _offers(bus),
+    "replug": lambda bus, _: bus.replug(),
+    "stats": lambda bus, _: bus.stats(),
+    "touch": lambda bus, how: touch(bus, *how),
+    "unplug": lambda bus, _: bus.unplug(),
+}
+
+
 def _main() -> None:
     spec = json.loads(sys.argv[1])
-    protocol = spec.pop("protocol")
+    protocol, dial = spec.pop("protocol"), spec.pop("dial", "")
     devices = _MAKERS[protocol](**spec)
-    with VirtualBus.pty(*devices, ring=None) as bus:
+    one = dialling(devices, dial) if dial else VirtualBus.pty(*devices, ring=None)
+    with one as bus:
         print(json.dumps(bus.url), flush=True)
         for line in sys.stdin:
-            print(json.dumps(_do(bus, json.loads(line))), flush=True)
+            ((command, about),) = json.loads(line).items()
+            print(json.dumps(_COMMANDS[command](bus, about)), flush=True)
 
 
 if __name__ == "__main__":
