@@ -11,6 +11,7 @@ from . import (
     abl_scan,
     evbox_bus,
     ews_events,
+    ews_listener,
     ews_poll,
     exchange_cpu,
     home_assistant,
@@ -34,6 +35,7 @@ BENCHMARKS: Final = {
         smartevse_polled,
         ews_poll,
         ews_events,
+        ews_listener,
     )
 }
 

@@ -64,6 +64,15 @@ def touch(bus: Buses, name: str, what: str, port: int, *values: int) -> float:
     return bus.call(now)
 
 
+def plug_in(bus: Buses) -> None:
+    """Let a car come to each port."""
+    for box in bus.devices:
+        if isinstance(box, EwsBox):
+            for port in box.ports:
+                if port.car is not None:
+                    port.car.plug_in()
+
+
 def asked(bus: Buses, since: float) -> dict[str, list[tuple[float, str]]]:
     """Return what each box has been asked from then on: when, and by which command."""
     return bus.call(

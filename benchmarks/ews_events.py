@@ -24,14 +24,13 @@ after the one before was confirmed. At random moments key 1 of a port goes down 
 150 ms or more later, up: until the state_changed event of that port's event entity
 (one monotonic clock for both processes). 'On our side': from the end of the info
 record on the wire, which takes 1.4 ms of RS-232 and waits for the end of an answer.
-Start requests are made, and taken back, by the box's web page: until the state_changed
-event of the binary sensor, for which the box has to be asked (rc and rd) first."""
+Start requests are made, and taken back 0.3 to 0.6 s later, by the box's web page: until
+the state_changed event of the binary sensor, for which the box has to be asked (rc and
+rd, 21 ms of RS-232) first."""
 
 SERIAL: Final = "000000000701"
 BOX: Final = f"ews-{SERIAL}"
 SLOW: Final = 2.0
-PAUSES: Final = (0.15, 0.45)
-"""Shortest and longest time between two things that a person does, s."""
 REST: Final = 1.5
 """So long what was done last may take, s."""
 RECORD: Final = b"\x02\x00\x0bIif"
@@ -59,6 +58,8 @@ class _Kind:
     key: str
     deeds: tuple[tuple[str, str], tuple[str, str]]
     """What is done in turn, and what is to be seen then."""
+    pauses: tuple[float, float]
+    """Shortest and longest time between two of them, s."""
     values: tuple[int, ...] = ()
 
 
@@ -67,6 +68,7 @@ KEY: Final = _Kind(
     "event",
     "key_1",
     (("key_down", "press_start"), ("key_up", "press_end")),
+    (0.15, 0.45),
     (1,),
 )
 START: Final = _Kind(
@@ -74,6 +76,9 @@ START: Final = _Kind(
     "binary_sensor",
     "start_requested",
     (("ask_for_start", "on"), ("take_back", "off")),
+    # Sooner, the second one would wait: a box is not asked more often than this
+    # because of what it tells (INFO_PAUSE).
+    (0.3, 0.6),
 )
 
 
@@ -160,7 +165,7 @@ async def _do_at_random(
     while loop.time() < until:
         port = 1 + len(done) // 2 % 2
         for deed, what in kind.deeds:
-            await asyncio.sleep(dice.uniform(*PAUSES))
+            await asyncio.sleep(dice.uniform(*kind.pauses))
             at = await witness.touch(BOX, deed, port, *kind.values)
             done.append(Happened(at, port, what))
     return done

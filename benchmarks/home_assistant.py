@@ -1,17 +1,15 @@
 """(e) What a house with many chargers costs Home Assistant."""
 
-from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
-from .figures import Figure, percentile
+from .cost import block_figure, cost_figures, measure
+from .figures import Figure
 from .house import LOADED, House
 from .progress import say
 from .setup import ABL_LIMIT, EVBOX_LIMIT
 from .witness import Witness
 
 NAME = "home-assistant"
-_figure = partial(Figure, NAME)
 METHOD = f"""\
 One real Home Assistant ({LOADED}), started as its own runner does; measured idle,
 then after adding 16 ABL boxes and 8 EVBox ChargePoints of 20 modules (a car charging
@@ -26,8 +24,6 @@ IDS = range(1, 17)
 SERIALS = range(1923051, 1923059)
 MODULES = 20
 INTERVAL = 5.0
-LONGEST_BLOCK = 10.0
-"""Aim, ms."""
 
 
 async def run(*, quick: bool) -> list[Figure]:
@@ -42,22 +38,17 @@ async def run(*, quick: bool) -> list[Figure]:
             # What it does after its start is not ours.
             await house.do("cost", seconds=15.0 if quick else 45.0)
             say(f"idle, 2 x {seconds:.0f} s")
-            idle = await _measure(house, seconds)
+            idle = await measure(house, seconds)
             say("adding 16 ABL boxes and 8 ChargePoints of 20 modules")
             adding = await house.do("watched_add", buses=[_abl(abl), _evbox(evbox)])
             # EVBox: two replies must agree, and until then a box is left alone.
             await house.do("cost", seconds=30.0)
             say(f"all polled, 2 x {seconds:.0f} s")
-            polled = await _measure(house, seconds)
-    return _figures(idle, adding, polled)
-
-
-async def _measure(house: House, seconds: float) -> dict[str, Any]:
-    return {
-        **await house.do("cost", seconds=seconds),
-        **await house.do("blocks", seconds=seconds),
-        **await house.do("count"),
-    }
+            polled = await measure(house, seconds)
+    return [
+        *cost_figures(NAME, idle, polled, "all chargers"),
+        block_figure(NAME, "longest block while they are added", adding),
+    ]
 
 
 def _abl(witness: Witness) -> dict[str, Any]:
@@ -96,51 +87,3 @@ def _evbox(witness: Witness) -> dict[str, Any]:
             for one in SERIALS
         ],
     }
-
-
-def _figures(
-    idle: Mapping[str, Any], adding: Mapping[str, Any], polled: Mapping[str, Any]
-) -> list[Figure]:
-    new = polled["states"] - idle["states"]
-    rate = polled["changes_per_second"] - idle["changes_per_second"]
-    return [
-        _figure("CPU, idle", idle["cpu"] * 100, "% of a core"),
-        _figure(
-            "CPU, more with all chargers",
-            (polled["cpu"] - idle["cpu"]) * 100,
-            "% of a core",
-            note=f"{new} entities with a state, {rate:.0f} changes/s",
-        ),
-        _figure("memory, idle", idle["memory"] / 1e6, "MB"),
-        _figure(
-            "memory, more with all chargers",
-            (polled["memory"] - idle["memory"]) / 1e6,
-            "MB",
-        ),
-        _figure("longest block, idle", _longest(idle), "ms"),
-        _block("longest block, all polled", polled, aim=LONGEST_BLOCK),
-        _figure(
-            "p99.9 of callbacks, all polled",
-            _p999(polled),
-            "ms",
-            digits=2,
-            note=f"{polled['callbacks']} callbacks",
-        ),
-        _block("longest block while they are added", adding),
-    ]
-
-
-def _block(name: str, blocks: Mapping[str, Any], aim: float | None = None) -> Figure:
-    took, own, what = blocks["longest"][0]
-    note = f"own time {own * 1000:.1f} ms: {what}"
-    return _figure(name, took * 1000, "ms", aim=aim, note=note)
-
-
-def _longest(blocks: Mapping[str, Any]) -> float:
-    return float(blocks["longest"][0][0]) * 1000
-
-
-def _p999(blocks: Mapping[str, Any]) -> float:
-    # Only those above a millisecond are told one by one.
-    short = blocks["callbacks"] - len(blocks["seconds"])
-    return percentile([0.0] * short + blocks["seconds"], 0.999) * 1000

@@ -69,9 +69,11 @@ async def _until(
 ) -> float:
     """Wait until all ports are there, or none; return how long it took, s."""
     async with asyncio.timeout(patience):
-        while any(_is_there(hass, unit) is not available for unit in _units(hass)):
+        while True:
+            # A look costs little; to be told of each of thousands of changes, much.
+            if all(_is_there(hass, unit) is available for unit in _units(hass)):
+                return time.monotonic() - since
             await asyncio.sleep(_LOOK)
-    return time.monotonic() - since
 
 
 async def _add_boxes(
@@ -83,7 +85,7 @@ async def _add_boxes(
         since = time.monotonic()
         await add_entry(hass, **about)
         took = await _until(hass, available=True, since=since)
-    return {"seconds": took, **blocks.as_dict()}
+    return {"took": took, **blocks.as_dict()}
 
 
 async def _reload(hass: Any) -> dict[str, Any]:  # noqa: ANN401
@@ -93,7 +95,7 @@ async def _reload(hass: Any) -> dict[str, Any]:  # noqa: ANN401
         for entry in hass.config_entries.async_entries("evse_bus"):
             await hass.config_entries.async_reload(entry.entry_id)
         took = await _until(hass, available=True, since=since)
-    return {"seconds": took, **blocks.as_dict()}
+    return {"took": took, **blocks.as_dict()}
 
 
 async def _remove(hass: Any) -> None:  # noqa: ANN401

@@ -17,7 +17,15 @@ from typing import Any, Final, Self
 from tests.virtual import CLIENT, AblBox, Car, EvboxChargePoint, Module, VirtualBus
 from tests.virtual.device import Device
 
-from .ews_boxes import Buses, asked, buses_of, dialling, ews_boxes, touch
+from .ews_boxes import (
+    Buses,
+    asked,
+    buses_of,
+    dialling,
+    ews_boxes,
+    plug_in,
+    touch,
+)
 from .machine import ROOT
 from .offers import Offer, offers_of, smartevse_boxes
 
@@ -106,6 +114,10 @@ class Witness:
         """Return what each EWS-Box has been asked from then on, and when."""
         entries: dict[str, Any] = await self._ask({"asked": since})
         return {name: [(at, what) for at, what in one] for name, one in entries.items()}
+
+    async def plug_in(self) -> None:
+        """Let a car come to each port of all EWS-Boxes."""
+        await self._ask({"plug_in": True})
 
     async def unplug(self) -> None:
         """Pull the adapter, or all network cables."""
@@ -214,6 +226,7 @@ _COMMANDS: Final[dict[str, Callable[[Buses, Any], object]]] = {
     "kill": _kill,
     "log": _log,
     "offers": lambda bus, _: _offers(bus),
+    "plug_in": lambda bus, _: plug_in(bus),
     "replug": lambda bus, _: bus.replug(),
     "stats": lambda bus, _: bus.stats(),
     "touch": lambda bus, how: touch(bus, *how),

@@ -1,0 +1,222 @@
+"""(j) 50 EWS-Boxes that dial one listener: what they cost, and who waits for whom."""
+
+import asyncio
+from collections.abc import Mapping, Sequence
+from functools import partial
+from statistics import fmean
+import time
+from typing import Any, Final
+
+from .cost import block_figure, cost_figures, measure
+from .ews_boxes import REDIALS_AFTER
+from .figures import Figure, gaps, percentile
+from .house import LOADED, House, free_port
+from .house_boxes import box_entry
+from .progress import say
+from .witness import Witness
+
+NAME = "ews-listener"
+_figure = partial(Figure, NAME)
+
+BOXES: Final = 50
+INTERVAL: Final = 2.0
+FIRST_SERIAL: Final = 20_140_600_001
+SHORT: Final = 3.0
+"""A network that is away for so long is back before anybody has noticed, s."""
+LONG: Final = 40.0
+"""All connections have been given up long before, s."""
+LONGEST: Final = 1800.0
+"""All of it, s."""
+
+METHOD = f"""\
+A real Home Assistant ({LOADED}); {BOXES} virtual EWS-Boxes of two ports, in one other
+process, dial its listener on 127.0.0.1, again {REDIALS_AFTER:g} s after each that comes
+to nothing. All are polled every 2 s, once with free ports, then with a car charging at
+each of the 100 ports. CPU, memory and blocks as in home-assistant. A period is the time
+between two rc that a box has heard, by its own diary. 'Until all are there': until no
+port's status is unavailable; from the moment when the set-up is begun (boxes dial
+already), and from when all network cables are put back: {SHORT:g} s after they were
+pulled, when nobody has noticed yet, and {LONG:g} s after. A pulled cable leaves the
+connection half-open. Who is one too many at once is hung up on, and dials again."""
+
+
+async def run(*, quick: bool) -> list[Figure]:
+    """Return the figures."""
+    seconds = 15.0 if quick else 90.0
+    serials = [f"{FIRST_SERIAL + number:012d}" for number in range(BOXES)]
+    boxes = [{"serial": serial} for serial in serials]
+    port = free_port()
+    async with asyncio.timeout(LONGEST):
+        say("starting Home Assistant")
+        async with House() as house:
+            # What it does after its start is not ours.
+            await house.do("cost", seconds=15.0 if quick else 45.0)
+            say(f"idle, 2 x {seconds:.0f} s")
+            idle = await measure(house, seconds)
+            async with Witness("ews", boxes=boxes, dial=f"127.0.0.1:{port}") as witness:
+                say(f"adding {BOXES} boxes that dial already")
+                entry = box_entry(
+                    serials, interval=INTERVAL, host="127.0.0.1", port=port
+                )
+                adding = await house.do("add_boxes", **entry)
+                begun = await house.do("statistics")
+                # Clocks and limits are set, the recorder writes the new entities.
+                await house.do("cost", seconds=20.0)
+                return [
+                    *await _polled(house, witness, idle, seconds),
+                    *_there("added", adding["took"], begun),
+                    block_figure(NAME, "longest block while they are added", adding),
+                    *await _away(house, witness, SHORT),
+                    *await _away(house, witness, LONG),
+                    *await _reloaded(house),
+                ]
+
+
+async def _polled(
+    house: House, witness: Witness, idle: Mapping[str, Any], seconds: float
+) -> list[Figure]:
+    """Measure them free, and charging."""
+    before = (await witness.stats())["dropped"]
+    since = time.monotonic()
+    say(f"{BOXES} boxes with free ports, 2 x {seconds:.0f} s")
+    free = await measure(house, seconds)
+    say("all charge")
+    await witness.plug_in()
+    # A car is found within a second; its port is read every two.
+    await house.do("cost", seconds=5.0)
+    took = await house.do("charge")
+    await house.do("cost", seconds=10.0)
+    say(f"{BOXES} boxes with 100 cars, 2 x {seconds:.0f} s")
+    charging = await measure(house, seconds)
+    counted = await house.do("statistics")
+    asked = await witness.asked(since)
+    stats = await witness.stats()
+    open_ports = sum(
+        status in (0x40, 0x41)
+        for device in stats["devices"].values()
+        for status in device["status"]
+    )
+    return [
+        _figure(
+            "CPU, more with free ports",
+            (free["cpu"] - idle["cpu"]) * 100,
+            "% of a core",
+            note=f"{free['changes_per_second']:.0f} changes/s",
+        ),
+        *cost_figures(NAME, idle, charging, "100 cars charging"),
+        _figure(
+            "100 starts by one call",
+            took,
+            "s",
+            digits=2,
+            note=f"{open_ports} ports charge",
+        ),
+        *_periods([_polls(one) for one in asked.values()]),
+        _figure(
+            "missed deadlines",
+            counted["missed_deadlines"],
+            aim=0,
+            digits=0,
+            note=f"{counted['requests']} requests, {counted['timeouts']} time-outs,"
+            f" {counted['bad_frames']} bad frames",
+        ),
+        _figure(
+            "connections dropped",
+            _dropped(stats["dropped"]) - _dropped(before),
+            aim=0,
+            digits=0,
+            note=f"in {time.monotonic() - since:.0f} s",
+        ),
+    ]
+
+
+async def _away(house: House, witness: Witness, seconds: float) -> list[Figure]:
+    """Pull all network cables, and put them back."""
+    say(f"all network cables pulled for {seconds:.0f} s")
+    before = await house.do("statistics")
+    pulled = time.monotonic()
+    await witness.unplug()
+    figures: list[Figure] = []
+    name = f"away for {seconds:.0f} s"
+    if seconds > SHORT:
+        took = await house.do("until", available=False, since=pulled)
+        figures.append(
+            _figure(f"{name}: until all are unavailable", took, "s", digits=2)
+        )
+    await asyncio.sleep(pulled + seconds - time.monotonic())
+    back = time.monotonic()
+    await witness.replug()
+    # Before that, a port may look as if it had never been away.
+    await _until_connected(witness)
+    took = await house.do("until", available=True, since=back)
+    after = await house.do("statistics")
+    counted = {name: after[name] - before[name] for name in after}
+    # Those that were replaced are counted now; the next thing begins at rest.
+    await house.do("cost", seconds=20.0)
+    return [*figures, *_there(name, took, counted)]
+
+
+async def _until_connected(witness: Witness) -> None:
+    while True:
+        if (await witness.stats())["connected"] == BOXES:
+            return
+        await asyncio.sleep(0.05)
+
+
+async def _reloaded(house: House) -> list[Figure]:
+    say("the listener is set up anew")
+    reloaded = await house.do("reload")
+    counted = await house.do("statistics")
+    return [
+        *_there("reloaded", reloaded["took"], counted),
+        block_figure(NAME, "longest block while they are set up anew", reloaded),
+    ]
+
+
+def _there(name: str, seconds: float, counted: Mapping[str, int]) -> list[Figure]:
+    note = (
+        f"{counted['accepted']} accepted, {counted['crowded_out']} too many at once,"
+        f" {counted['replaced']} replaced"
+    )
+    return [
+        _figure(f"{name}: until all are there", seconds, "s", digits=2, note=note),
+    ]
+
+
+def _polls(asked: Sequence[tuple[float, str]]) -> list[float]:
+    return [at for at, what in asked if what == "rc"]
+
+
+def _periods(polls: Sequence[Sequence[float]]) -> list[Figure]:
+    """Return the figures of when each box was asked how its ports are."""
+    each = [gaps(one) for one in polls]
+    every = [period for one in each for period in one]
+    worst = max(each, key=lambda one: percentile(one, 0.99))
+    return [
+        _figure("poll period: mean", fmean(every), "s", digits=3),
+        _figure("poll period: p50", percentile(every, 0.5), "s", digits=3),
+        _figure(
+            "poll period: p99",
+            percentile(every, 0.99),
+            "s",
+            digits=3,
+            note=f"{len(every)} periods of {len(each)} boxes",
+        ),
+        _figure("poll period: longest", max(every), "s", digits=3),
+        _figure(
+            "poll period of the box with the worst p99: p50",
+            percentile(worst, 0.5),
+            "s",
+            digits=3,
+        ),
+        _figure(
+            "poll period of the box with the worst p99: p99",
+            percentile(worst, 0.99),
+            "s",
+            digits=3,
+        ),
+    ]
+
+
+def _dropped(by_box: Mapping[str, Sequence[str]]) -> int:
+    return sum(len(one) for one in by_box.values())
