@@ -154,6 +154,16 @@ class EwsReader(Charger):
         self._meet_deadline(now)
 
     @override
+    def heard(self, now: float) -> None:
+        is_back = not self.available
+        super().heard(now)
+        if is_back and self.bus is not None:
+            # It is there for its other port, too: that one waits for no next try.
+            for other in self.bus.chargers.values():
+                if isinstance(other, EwsReader) and not other.available:
+                    other.hurry()
+
+    @override
     def missed(self, now: float) -> None:
         super().missed(now)
         self._meet_deadline(now)

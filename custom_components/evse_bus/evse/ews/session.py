@@ -101,6 +101,8 @@ class EwsBox:
         """Forget everything if the line was opened since the last call."""
         if times != self._opened:
             self._opened = times
+            # The reading it was answered under last is the first to be tried.
+            self._tries = 0
             self.forget()
 
     @property
