@@ -245,6 +245,9 @@ def test_fifty_boxes() -> None:
                     group.create_task(bus.start())
             with EwsFleet(boxes, HOST, made.port, retry=0.1, source_ports=0):
                 await until(lambda: all(map(has_reading, buses)), 30)
+                # All have dialled in the same moment, and nobody had to do so twice.
+                assert made.statistics.accepted == len(boxes)
+                assert made.statistics.crowded_out == 0
                 await until(lambda: all(box.ports[0].limit == 16 for box in boxes), 30)
                 await asyncio.sleep(2.5)
                 assert sum(bus.wire.statistics.missed_deadlines for bus in buses) == 0

@@ -34,7 +34,8 @@ type Network = IPv4Network | IPv6Network
 IDENTIFY_TIME: Final = 10.0
 """Longest time to say who one is, s."""
 MOST_UNIDENTIFIED: Final = 16
-"""Connections that have not said yet who they are, at once."""
+"""Connections that have not said yet who they are, at once, beside one for each box
+that is set up: after a power cut all of them dial in the same moment."""
 GRACE: Final = 1.0
 """One of those that is older may have to go for a newer one, s."""
 MOST_STRANGERS: Final = 8
@@ -232,7 +233,7 @@ class Listener:
 
     def _has_room(self) -> bool:
         """Return whether one more may say who he is; the slowest goes for him."""
-        if len(self._unidentified) < MOST_UNIDENTIFIED:
+        if len(self._unidentified) < MOST_UNIDENTIFIED + len(self._buses):
             return True
         oldest, since = next(iter(self._unidentified.items()))
         if asyncio.get_running_loop().time() - since < GRACE:
