@@ -77,7 +77,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("names", nargs="*", choices=BENCHMARKS, metavar="NAME")
     parser.add_argument(
-        "--quick", action="store_true", help="a short run: rough figures in 8 minutes"
+        "--quick", action="store_true", help="a short run: rough figures in 15 minutes"
     )
     return parser
 

@@ -8,11 +8,15 @@ from asyncio import Handle
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+import gc
 import heapq
+import threading
 import time
 from typing import Any, Final
 
 KEPT: Final = 5
+_MENTIONED: Final = 1e-3
+"""Shortest garbage collection that is told of, s."""
 
 
 @dataclass(slots=True)
@@ -23,6 +27,8 @@ class Blocks:
     """Wall time of each, s: also what other threads and processes took from it."""
     longest: list[tuple[float, float, str]] = field(default_factory=list)
     """Of the longest ones: wall time and this thread's own processor time, s; what."""
+    busiest: tuple[float, str] = (0.0, "")
+    """Most processor time of one, s, without the interpreter's garbage collection."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return what can be sent to another process."""
@@ -30,32 +36,60 @@ class Blocks:
             "seconds": [one for one in self.seconds if one > 1e-3],  # noqa: PLR2004
             "callbacks": len(self.seconds),
             "longest": sorted(self.longest, reverse=True),
+            "busiest": self.busiest,
         }
+
+
+class _Collections:
+    """How much processor time garbage collection has taken from this thread, s."""
+
+    def __init__(self) -> None:
+        self.taken = 0.0
+        self._thread = threading.get_ident()
+        self._begun = 0.0
+
+    def __call__(self, phase: str, _info: dict[str, int]) -> None:
+        if threading.get_ident() != self._thread:
+            return
+        if phase == "start":
+            self._begun = time.thread_time()
+        else:
+            self.taken += time.thread_time() - self._begun
 
 
 @contextmanager
 def watch() -> Iterator[Blocks]:
     """Time all callbacks of all loops of this process."""
     blocks = Blocks()
+    collections = _Collections()
     run = Handle._run  # noqa: SLF001 - the one place that everything passes
 
     def timed(handle: Handle) -> None:
         what: object = getattr(handle, "_callback", None)
+        collected = collections.taken
         wall, own = time.perf_counter(), time.thread_time()
         run(handle)
-        took = time.perf_counter() - wall
+        took, used = time.perf_counter() - wall, time.thread_time() - own
+        collected = collections.taken - collected
         blocks.seconds.append(took)
+        if used - collected > blocks.busiest[0]:
+            blocks.busiest = (used - collected, _name(what))
         if len(blocks.longest) < KEPT or took > blocks.longest[0][0]:
-            entry = (took, time.thread_time() - own, _name(what))
+            name = _name(what)
+            if collected > _MENTIONED:
+                name += f", {collected * 1000:.0f} ms of it garbage collection"
+            entry = (took, used, name)
             if len(blocks.longest) < KEPT:
                 heapq.heappush(blocks.longest, entry)
             else:
                 heapq.heapreplace(blocks.longest, entry)
 
     Handle._run = timed  # type: ignore[method-assign, assignment] # noqa: SLF001
+    gc.callbacks.append(collections)
     try:
         yield blocks
     finally:
+        gc.callbacks.remove(collections)
         Handle._run = run  # type: ignore[method-assign] # noqa: SLF001
 
 

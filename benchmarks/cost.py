@@ -45,6 +45,7 @@ def cost_figures(
         ),
         figure("longest block, idle", idle["longest"][0][0] * 1000, "ms"),
         block_figure(benchmark, "longest block, all polled", polled, aim=LONGEST_BLOCK),
+        busy_figure(benchmark, "all polled", polled, aim=LONGEST_BLOCK),
         Figure(
             benchmark,
             "p99.9 of callbacks, all polled",
@@ -63,6 +64,15 @@ def block_figure(
     took, own, what = blocks["longest"][0]
     note = f"own time {own * 1000:.1f} ms: {what}"
     return Figure(benchmark, name, took * 1000, "ms", aim=aim, note=note)
+
+
+def busy_figure(
+    benchmark: str, name: str, blocks: Mapping[str, Any], aim: float | None = None
+) -> Figure:
+    """Return the most processor time that one callback has used, and which."""
+    used, what = blocks["busiest"]
+    name = f"most own time of one callback, {name}"
+    return Figure(benchmark, name, used * 1000, "ms", aim=aim, note=what)
 
 
 def _p999(blocks: Mapping[str, Any]) -> float:

@@ -5,9 +5,9 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from statistics import fmean
 import time
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
-from .cost import block_figure, cost_figures, measure
+from .cost import block_figure, busy_figure, cost_figures, measure
 from .ews_boxes import REDIALS_AFTER
 from .figures import Figure, gaps, percentile
 from .house import LOADED, House, free_port
@@ -33,11 +33,12 @@ A real Home Assistant ({LOADED}); {BOXES} virtual EWS-Boxes of two ports, in one
 process, dial its listener on 127.0.0.1, again {REDIALS_AFTER:g} s after each that comes
 to nothing. All are polled every 2 s, once with free ports, then with a car charging at
 each of the 100 ports. CPU, memory and blocks as in home-assistant. A period is the time
-between two rc that a box has heard, by its own diary. 'Until all are there': until no
-port's status is unavailable; from the moment when the set-up is begun (boxes dial
-already), and from when all network cables are put back: {SHORT:g} s after they were
-pulled, when nobody has noticed yet, and {LONG:g} s after. A pulled cable leaves the
-connection half-open. Who is one too many at once is hung up on, and dials again."""
+between two rc that a box has heard, by its own diary, while all are just polled. 'Until
+all are there': until no port's status is unavailable; from the moment when the set-up is
+begun (boxes dial already), and from when all network cables, which leave half-open
+connections when they are pulled, are put back: {LONG:g} s after, and {SHORT:g} s after,
+when nobody has noticed yet; then it is until the last box has been asked rc again. A
+number that is connected keeps its connection until that has not answered for 10 s."""
 
 
 async def run(*, quick: bool) -> list[Figure]:
@@ -60,12 +61,20 @@ async def run(*, quick: bool) -> list[Figure]:
                 )
                 adding = await house.do("add_boxes", **entry)
                 begun = await house.do("statistics")
-                # Clocks and limits are set, the recorder writes the new entities.
+                new = await house.do("cost", seconds=0.1)
+                # Clocks and limits are set; Home Assistant writes the new entities.
                 await house.do("cost", seconds=20.0)
                 return [
                     *await _polled(house, witness, idle, seconds),
+                    _figure(
+                        "memory, more at once when they are added",
+                        (new["memory"] - idle["memory"]) / 1e6,
+                        "MB",
+                        note="before Home Assistant writes its registries",
+                    ),
                     *_there("added", adding["took"], begun),
                     block_figure(NAME, "longest block while they are added", adding),
+                    busy_figure(NAME, "while they are added", adding),
                     *await _away(house, witness, SHORT),
                     *await _away(house, witness, LONG),
                     *await _reloaded(house),
@@ -76,10 +85,12 @@ async def _polled(
     house: House, witness: Witness, idle: Mapping[str, Any], seconds: float
 ) -> list[Figure]:
     """Measure them free, and charging."""
+    counted = await house.do("statistics")
     before = (await witness.stats())["dropped"]
     since = time.monotonic()
     say(f"{BOXES} boxes with free ports, 2 x {seconds:.0f} s")
     free = await measure(house, seconds)
+    polls = [_Window(since, time.monotonic())]
     say("all charge")
     await witness.plug_in()
     # A car is found within a second; its port is read every two.
@@ -87,15 +98,12 @@ async def _polled(
     took = await house.do("charge")
     await house.do("cost", seconds=10.0)
     say(f"{BOXES} boxes with 100 cars, 2 x {seconds:.0f} s")
+    begun = time.monotonic()
     charging = await measure(house, seconds)
-    counted = await house.do("statistics")
+    polls.append(_Window(begun, time.monotonic()))
     asked = await witness.asked(since)
     stats = await witness.stats()
-    open_ports = sum(
-        status in (0x40, 0x41)
-        for device in stats["devices"].values()
-        for status in device["status"]
-    )
+    after = await house.do("statistics")
     return [
         _figure(
             "CPU, more with free ports",
@@ -109,16 +117,16 @@ async def _polled(
             took,
             "s",
             digits=2,
-            note=f"{open_ports} ports charge",
+            note=f"{_charging(stats)} ports charge",
         ),
-        *_periods([_polls(one) for one in asked.values()]),
+        *period_figures(asked, polls),
         _figure(
             "missed deadlines",
-            counted["missed_deadlines"],
+            after["missed_deadlines"],
             aim=0,
             digits=0,
-            note=f"{counted['requests']} requests, {counted['timeouts']} time-outs,"
-            f" {counted['bad_frames']} bad frames",
+            note=f"{after['requests'] - counted['requests']} requests,"
+            f" {after['timeouts']} time-outs, {after['bad_frames']} bad frames",
         ),
         _figure(
             "connections dropped",
@@ -128,6 +136,14 @@ async def _polled(
             note=f"in {time.monotonic() - since:.0f} s",
         ),
     ]
+
+
+def _charging(stats: Mapping[str, Any]) -> int:
+    return sum(
+        status in (0x40, 0x41)
+        for device in stats["devices"].values()
+        for status in device["status"]
+    )
 
 
 async def _away(house: House, witness: Witness, seconds: float) -> list[Figure]:
@@ -146,21 +162,24 @@ async def _away(house: House, witness: Witness, seconds: float) -> list[Figure]:
     await asyncio.sleep(pulled + seconds - time.monotonic())
     back = time.monotonic()
     await witness.replug()
-    # Before that, a port may look as if it had never been away.
-    await _until_connected(witness)
-    took = await house.do("until", available=True, since=back)
+    polled = await _until_polled(witness, back)
+    took = max(polled, await house.do("until", available=True, since=back))
     after = await house.do("statistics")
     counted = {name: after[name] - before[name] for name in after}
-    # Those that were replaced are counted now; the next thing begins at rest.
-    await house.do("cost", seconds=20.0)
+    # The next thing begins at rest.
+    await house.do("cost", seconds=15.0)
     return [*figures, *_there(name, took, counted)]
 
 
-async def _until_connected(witness: Witness) -> None:
+async def _until_polled(witness: Witness, since: float) -> float:
+    """Wait until each box has been asked how its ports are; return how long, s."""
     while True:
-        if (await witness.stats())["connected"] == BOXES:
-            return
-        await asyncio.sleep(0.05)
+        asked = (await witness.asked(since)).values()
+        first = [next(iter(_polls(one)), None) for one in asked]
+        times = [at for at in first if at is not None]
+        if len(times) == BOXES:
+            return max(times) - since
+        await asyncio.sleep(0.1)
 
 
 async def _reloaded(house: House) -> list[Figure]:
@@ -170,6 +189,7 @@ async def _reloaded(house: House) -> list[Figure]:
     return [
         *_there("reloaded", reloaded["took"], counted),
         block_figure(NAME, "longest block while they are set up anew", reloaded),
+        busy_figure(NAME, "while they are set up anew", reloaded),
     ]
 
 
@@ -187,35 +207,45 @@ def _polls(asked: Sequence[tuple[float, str]]) -> list[float]:
     return [at for at, what in asked if what == "rc"]
 
 
-def _periods(polls: Sequence[Sequence[float]]) -> list[Figure]:
+class _Window(NamedTuple):
+    """A while, s of CLOCK_MONOTONIC."""
+
+    begin: float
+    end: float
+
+
+def period_figures(
+    asked: Mapping[str, Sequence[tuple[float, str]]], windows: Sequence[_Window]
+) -> list[Figure]:
     """Return the figures of when each box was asked how its ports are."""
-    each = [gaps(one) for one in polls]
+    each = [
+        [
+            period
+            for begin, end in windows
+            for period in gaps(at for at in _polls(one) if begin <= at < end)
+        ]
+        for one in asked.values()
+    ]
     every = [period for one in each for period in one]
     worst = max(each, key=lambda one: percentile(one, 0.99))
     return [
-        _figure("poll period: mean", fmean(every), "s", digits=3),
-        _figure("poll period: p50", percentile(every, 0.5), "s", digits=3),
-        _figure(
-            "poll period: p99",
+        _seconds("poll period, mean", fmean(every)),
+        _seconds("poll period, p50", percentile(every, 0.5)),
+        _seconds(
+            "poll period, p99",
             percentile(every, 0.99),
-            "s",
-            digits=3,
-            note=f"{len(every)} periods of {len(each)} boxes",
+            f"{len(every)} periods of {len(each)} boxes",
         ),
-        _figure("poll period: longest", max(every), "s", digits=3),
-        _figure(
-            "poll period of the box with the worst p99: p50",
-            percentile(worst, 0.5),
-            "s",
-            digits=3,
+        _seconds("poll period, longest", max(every)),
+        _seconds(
+            "poll period, p50 of the box with the worst p99", percentile(worst, 0.5)
         ),
-        _figure(
-            "poll period of the box with the worst p99: p99",
-            percentile(worst, 0.99),
-            "s",
-            digits=3,
-        ),
+        _seconds("poll period, p99 of that box", percentile(worst, 0.99)),
     ]
+
+
+def _seconds(name: str, value: float, note: str = "") -> Figure:
+    return _figure(name, value, "s", digits=3, note=note)
 
 
 def _dropped(by_box: Mapping[str, Sequence[str]]) -> int:

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from .cost import block_figure, cost_figures, measure
+from .cost import block_figure, busy_figure, cost_figures, measure
 from .figures import Figure
 from .house import LOADED, House
 from .progress import say
@@ -18,7 +18,9 @@ in processes of their own. CPU: user and system time of all its threads, as a sh
 one core. Memory: resident set after a garbage collection. Blocks: wall time of every
 callback of the event loop (asyncio's Handle._run timed, in a time of its own); what
 other processes of the machine take counts as if it were ours, so idle stands beside
-it. Own time: processor time of the event loop's thread in the longest one."""
+it. Own time: processor time of the event loop's thread in the longest one; 'most own
+time of one callback': in any of them, without the interpreter's garbage collection,
+which stops everything for the longer the more Home Assistant holds."""
 
 IDS = range(1, 17)
 SERIALS = range(1923051, 1923059)
@@ -48,6 +50,7 @@ async def run(*, quick: bool) -> list[Figure]:
     return [
         *cost_figures(NAME, idle, polled, "all chargers"),
         block_figure(NAME, "longest block while they are added", adding),
+        busy_figure(NAME, "while they are added", adding),
     ]
 
 

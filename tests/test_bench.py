@@ -1,6 +1,7 @@
 """The pure parts of the benchmarks; their figures are not for tests."""
 
 import asyncio
+import gc
 import json
 
 from hypothesis import given, strategies as st
@@ -15,13 +16,19 @@ from benchmarks.balancing import (
     sums,
 )
 from benchmarks.blocks import watch
+from benchmarks.ews_boxes import asked, buses_of, dialling, ews_boxes, touch
+from benchmarks.ews_events import Happened, delays, told_by
+from benchmarks.ews_listener import _Window, period_figures
+from benchmarks.ews_poll import IDEAL, RC, polls
 from benchmarks.figures import Figure, gaps, percentile, results, table
 from benchmarks.offers import Offer
 from benchmarks.responder import _answer
 from benchmarks.set_points import Called, offered_after
 from benchmarks.set_value import _seen
-from benchmarks.witness import Heard
+from benchmarks.witness import Heard, _log
 from custom_components.evse_bus.evse.modbus import AsciiFramer
+from tests.virtual import VirtualBus
+from tests.virtual.ews_frames import INFO, command, frame
 
 MEASURED = Figure(
     benchmark="scan", name="mean", value=271.04, unit="ms", aim=252.0, note="why"
@@ -233,3 +240,110 @@ async def test_blocks_are_timed_and_the_loop_left_as_it_was() -> None:
     assert asyncio.Handle._run is before
     assert blocks.seconds
     assert blocks.as_dict()["callbacks"] == len(blocks.seconds)
+
+
+async def test_garbage_collection_is_told_apart_from_what_a_callback_does() -> None:
+    # Something to go through: more of it than the little that is told of.
+    held = [[n] for n in range(300_000)]
+    with watch() as blocks:
+        await asyncio.sleep(0)
+        gc.collect()
+        await asyncio.sleep(0)
+    assert len(held) == 300_000
+    (_, own, what) = max(blocks.longest)
+    assert "ms of it garbage collection" in what
+    assert blocks.busiest[0] < own / 2
+
+
+# -- EWS-Boxes ---------------------------------------------------------------------
+
+
+def _ews(start: float, data: bytes, *, by_us: bool = True) -> Heard:
+    return Heard(start, start + 0.01, from_client=by_us, data=data)
+
+
+def test_polls_of_a_box_are_found_in_the_log() -> None:
+    log = [
+        _ews(1.0, command("rc")),
+        _ews(1.1, command("rc"), by_us=False),
+        _ews(1.2, command("rd")),
+        _ews(3.0, command("rc")),
+    ]
+    assert polls(log) == [1.0, 3.0]
+    # As the protocol's facts have it.
+    assert pytest.approx(10.6e-3, abs=0.05e-3) == RC
+    assert pytest.approx(20.7e-3, abs=0.05e-3) == IDEAL
+
+
+def test_what_is_seen_belongs_to_what_was_done() -> None:
+    done = [
+        Happened(1.0, 1, "press_start"),
+        Happened(1.2, 1, "press_end"),
+        # Never seen; the next one of its kind is, and is not taken for it.
+        Happened(2.0, 1, "press_start"),
+        Happened(3.0, 1, "press_start"),
+        Happened(4.0, 2, "press_start"),
+    ]
+    seen = [
+        Happened(0.5, 1, "press_start"),
+        Happened(1.01, 1, "press_start"),
+        Happened(1.22, 1, "press_end"),
+        Happened(3.03, 1, "press_start"),
+        # Another port's, and another kind.
+        Happened(4.01, 1, "press_start"),
+        Happened(4.02, 2, "press_end"),
+    ]
+    assert delays(done, seen) == pytest.approx([0.01, 0.02, 0.03])
+
+
+def test_the_record_that_tells_it_is_found() -> None:
+    record = frame(INFO, b"if" + bytes(9))
+    log = [
+        _ews(0.9, record, by_us=False),
+        _ews(1.005, command("rc")),
+        _ews(1.01, frame(b"A", b"rc" + bytes(108)), by_us=False),
+        _ews(1.03, record, by_us=False),
+    ]
+    (told,) = told_by(log, [Happened(1.0, 1, "on"), Happened(2.0, 1, "off")])
+    assert told == Happened(pytest.approx(1.04), 1, "on")
+
+
+def test_periods_are_those_within_a_while() -> None:
+    asked_of = {
+        "a": [(at, "rc") for at in (0.0, 2.0, 4.5, 10.0, 12.0)],
+        "b": [(1.0, "rc"), (1.1, "rd"), (3.0, "rc"), (11.0, "rc"), (13.5, "rc")],
+    }
+    figures = period_figures(asked_of, [_Window(0.0, 5.0), _Window(9.0, 13.0)])
+    found = {one.name: one.value for one in figures}
+    assert found["poll period, mean"] == pytest.approx((2.0 + 2.5 + 2.0 + 2.0) / 4)
+    assert found["poll period, longest"] == 2.5
+    assert found["poll period, p99 of that box"] == 2.5
+
+
+def test_a_box_is_touched_and_says_what_it_was_asked() -> None:
+    boxes = ews_boxes(boxes=[{"serial": "000000000042", "manual_io": True}])
+    with VirtualBus.pty(*boxes, ring=None) as bus:
+        before = bus.time()
+        at = touch(bus, "ews-000000000042", "key_down", 2, 3)
+        assert before <= at <= bus.time()
+        bus.wait_for(lambda: len(bus.log))
+        [[start, _, by_us, data, _]] = _log(bus, at)  # type: ignore[misc]
+        assert (start >= at, by_us) == (True, False)
+        # Key 3 of port 2 is pressed.
+        assert data[12:30] == "00" + "00" * 6 + "ff" + "00"
+        bus.inject(command("rc"), source="client")
+        assert asked(bus, at) == {"ews-000000000042": []}
+        bus.wait_for(lambda: asked(bus, at)["ews-000000000042"])
+        [[heard_at, name]] = asked(bus, at)["ews-000000000042"]
+        assert (heard_at > at, name) == (True, "rc")
+        assert asked(bus, heard_at + 1) == {"ews-000000000042": []}
+
+
+def test_many_boxes_are_many_lines() -> None:
+    boxes = ews_boxes(boxes=[{"serial": f"{n:012d}"} for n in (1, 2, 3)])
+    fleet = dialling(boxes, "127.0.0.1:4711")
+    assert [bus.devices[0].name for bus in buses_of(fleet)] == [
+        "ews-000000000001",
+        "ews-000000000002",
+        "ews-000000000003",
+    ]
