@@ -154,7 +154,7 @@ def _connector_cards(connector: Part) -> list[Card | None]:
             icon="mdi:gesture-tap-button",
             color="amber",
         ),
-        _tile(connector.find("locked"), HALF, name="Plug lock"),
+        _tile(connector.find("locked"), HALF, name="Cable lock"),
         _tile(
             connector.find("last_result"),
             FULL,

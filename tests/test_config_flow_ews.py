@@ -164,7 +164,7 @@ async def test_nobody_answers_then_the_first_box_that_comes_is_kept(
         flow = await searched(hass, bus)
         assert flow.step == "nothing_found"
         assert flow.result["menu_options"] == ["scan", "manual", "port"]
-        assert flow.tells("TxD and RxD", "X201", "115200 8N1", bus.url)
+        assert flow.tells("TxD and RxD", "configuration bridge", "115200 8N1", bus.url)
 
         await flow.choose("manual")
         assert flow.step == "box"
