@@ -138,7 +138,7 @@ def test_the_form_has_the_bounds_of_what_is_taken(subtests: pytest.Subtests) -> 
     for name, action in take.items():
         for key, bounds in number_fields(name):
             step = bounds.get("step", 1)
-            with subtests.test(key=key):
+            with subtests.test(key=str(key)):
                 action({key: bounds["min"]})
                 action({key: bounds["max"]})
                 for wrong in (bounds["min"] - step, bounds["max"] + step):
