@@ -175,6 +175,22 @@ async def test_faults_are_named_and_shown_as_a_problem(
         assert state_of(hass, other or "") == "off"
 
 
+async def test_a_car_that_wants_the_room_to_be_ventilated(
+    hass: HomeAssistant,
+) -> None:
+    box = EwsBox(cars=(quick_car(), quick_car()), fan=True)
+    box.ports[1].wants_fan = True
+    async with running(hass, box) as (entry, bus):
+        asks = await get_entity(hass, "binary_sensor", entry, "2_ventilation_requested")
+        runs = await get_entity(hass, "binary_sensor", entry, "ventilating")
+        await charge(hass, entry, bus, box, 2)
+        await wait_for_state(hass, asks, "on")
+        other = entity_id(hass, "binary_sensor", entry, "1_ventilation_requested")
+        assert state_of(hass, other or "") == "off"
+        # It is the box's fan, and told with the box.
+        await wait_for_state(hass, runs, "on")
+
+
 async def test_who_charges_is_private(hass: HomeAssistant) -> None:
     box = EwsBox(rfid=True)
     async with running(hass, box) as (entry, _):

@@ -197,6 +197,33 @@ async def test_a_charge_that_begins_against_a_pause_is_paused(
         assert state_of(hass, fail_safe) == "0.0"
 
 
+async def test_orders_that_nobody_renews_pause_and_go_on(hass: HomeAssistant) -> None:
+    """With a fail-safe of 0 A: the permission stands, only the current is missing."""
+    box = EwsBox(cars=(quick_car(),))
+    port = box.ports[0]
+    async with running(hass, box, order_lifetime=0.1, fail_safe_current=0.0) as (
+        entry,
+        bus,
+    ):
+        limit = await get_entity(hass, "number", entry, "1_charging_current")
+        expired = await get_entity(hass, "binary_sensor", entry, "1_orders_expired")
+        await call(hass, "number.set_value", limit, value=12)
+        switch = await charge(hass, entry, bus, box)
+        assert port.limit == 12
+        await wait_for_state(hass, expired, "on")
+        await bus.wait_for_async(lambda: not port.contactor, timeout=10)
+        assert orders(box) == [START, PAUSE]
+        assert port.locked
+        assert state_of(hass, switch) == "on"
+        await polled(bus, box, 10)
+        await call(hass, "number.set_value", limit, value=9)
+        await bus.wait_for_async(lambda: port.contactor, timeout=10)
+        assert orders(box) == [START, PAUSE, START]
+        assert port.limit == 9
+        assert not port.witness.unlockings
+        assert 0 not in limits(box)
+
+
 async def test_ended_at_the_box_stays_ended(hass: HomeAssistant) -> None:
     """A stop key has unlocked the cable: nobody's switch starts that charge again."""
     box = EwsBox(cars=(quick_car(),))

@@ -8,9 +8,13 @@ from homeassistant.config_entries import ConfigEntryState
 from homeassistant.core import HomeAssistant
 import pytest
 
+from custom_components.evse_bus.diagnostics import (
+    async_get_config_entry_diagnostics,
+)
 from custom_components.evse_bus.evse.ews import accepted, listener as listening_to
 from tests.common import (
     call,
+    ews_charger,
     get_entity,
     state_of,
     wait_for_state,
@@ -183,7 +187,8 @@ async def test_a_reload_and_an_unload_leave_nothing_behind(
 
 async def test_a_port_that_is_taken(hass: HomeAssistant) -> None:
     port = free_port()
-    entry = listener_entry(port)
+    box = EwsBox()
+    entry = listener_entry(port, ews_charger(box))
     entry.add_to_hass(hass)
     with socket.socket() as taken:
         taken.bind((HOST, port))
@@ -195,9 +200,14 @@ async def test_a_port_that_is_taken(hass: HomeAssistant) -> None:
         shown = text.format(**entry.error_reason_translation_placeholders)
         assert f"{HOST}:{port}" in shown
         assert not tasks()
+        # What helps to find out why can be downloaded all the same.
+        told = await async_get_config_entry_diagnostics(hass, entry)
+        assert [one["bus"]["connected"] for one in told["boxes"]] == [False]
     await hass.config_entries.async_reload(entry.entry_id)
     assert entry.state is ConfigEntryState.LOADED
-    await hass.config_entries.async_unload(entry.entry_id)
+    with dialler_of(entry, box):
+        await get_entity(hass, "sensor", entry, "1_status")
+        await hass.config_entries.async_unload(entry.entry_id)
 
 
 async def test_an_address_that_is_not_ours(hass: HomeAssistant) -> None:
