@@ -167,7 +167,9 @@ class EwsPort(EwsReader):
                 return not clamp(self.sought(change), self.limits).paused
 
             yield 0.0
-            async for pause in self.permission.start(talk, still):
+            async for pause in self.permission.start(
+                talk, still, for_current=change.allowed is not True
+            ):
                 yield pause
         finally:
             self.end(token)

@@ -17,7 +17,7 @@ from ..errors import (
 )
 from ..exchange import Talk
 from ..model import Fault, OrderChange
-from ..safety import Setpoint, clamp, expired
+from ..safety import Setpoint
 from ..turns import Turns
 from .answers import EwsRefusedError, Refusal
 from .commands import start_stop
@@ -49,20 +49,14 @@ _NOTHING_TO_START: Final = (FREE, SEARCHING, ENDED, ABORTED, BLOCKED)
 """No car waits for a start: permission is given, and there is nothing to say."""
 
 
-def _may_have_paused(port: EwsReader) -> bool:
-    orders = [port.orders]
-    if port.config.order_lifetime is not None:
-        orders.append(expired(port.orders))
-    return any(clamp(one, port.limits).paused for one in orders)
-
-
 class Permission:
     """What a port has been allowed, as far as it is our doing."""
 
     def __init__(self, port: EwsReader) -> None:
         """Take the port; what an earlier run of ours has paused nobody knows."""
         self._port = port
-        self.paused: bool | None = None if _may_have_paused(port) else False
+        # The orders do not tell: what has paused it may be gone from them.
+        self.paused: bool | None = None
         """We have paused this charge; ``None``: perhaps (an answer was lost, or it was
         before our time)."""
         self.waits_for_current = False
@@ -74,8 +68,14 @@ class Permission:
         self._time = 0
 
     def forget(self) -> None:
-        """Note that no pause of ours stands any more: restarted, stopped or unlocked."""
+        """Note that no pause of ours stands any more: stopped or unlocked."""
         self.paused = False
+        self.waits_for_current = False
+
+    def doubt(self) -> None:
+        """Note that a pause of ours stands perhaps, and gives nothing back any more."""
+        if self.paused:
+            self.paused = None
         self.waits_for_current = False
 
     # -- What is known -------------------------------------------------------------
@@ -83,18 +83,31 @@ class Permission:
     def watch(self, seen: PortStatus) -> None:
         """See whether our pause still stands."""
         if self.paused is False:
+            # It goes on, or somebody has ended it: whoever comes next did not wait.
+            self.waits_for_current = False
             return
         other = seen.session_time < self._time or seen.session_energy < self._energy
         self._time, self._energy = seen.session_time, seen.session_energy
         unlocked = self._was_locked and seen.locked is False
         self._was_locked = bool(seen.locked)
-        still = seen.status in AFTER_OUR_PAUSE and not unlocked and not other
+        unlocked |= self._is_free(seen)
+        still = seen.status in AFTER_OUR_PAUSE and not unlocked
         # Said a moment ago: it may not have followed yet.
         still |= seen.status in _CHARGING and self._is_settling()
         if not still:
             self.paused = False
             self._was_locked = False
-            self.waits_for_current &= seen.status in _CHARGING
+            self.waits_for_current = False
+        elif other:
+            # Another charge, or counters that begin anew with a pause: a 6 that is
+            # said again would unlock.
+            self.doubt()
+
+    def _is_free(self, seen: PortStatus) -> bool:
+        """Return whether a charge has ended with its plug free: no pause of ours."""
+        known = self._port.box.installation
+        has_lock = known is not None and known.fixed_cable is False
+        return has_lock and seen.status == ENDED and seen.locked is False
 
     def _is_settling(self) -> bool:
         bus = self._port.bus
@@ -160,7 +173,7 @@ class Permission:
         if sends and self.paused is None and seen.status in AFTER_OUR_PAUSE:
             # The answer was lost, and it has followed.
             self.paused = True
-        if for_current and self.paused is not False:
+        if for_current and self.paused is not False and self._said_at > -inf:
             self.waits_for_current = seen.status in AFTER_OUR_PAUSE
 
     async def _say_pause(self, talk: Talk, seen: PortStatus) -> None:
@@ -205,11 +218,14 @@ class Permission:
         )
         return asked and self.waits_for_current
 
-    async def start(self, talk: Talk, still: Callable[[], bool]) -> Turns:
+    async def start(
+        self, talk: Talk, still: Callable[[], bool], *, for_current: bool
+    ) -> Turns:
         """Let the car charge that waits, or that we have paused.
 
         Where there is nothing to start, nothing is said. ``still`` is asked right
-        before each word. Raises NotAvailableError in a state in which nothing can be
+        before each word. ``for_current``: only a limit wants so, for the car that a
+        limit has stopped and no other. Raises NotAvailableError in a state in which nothing can be
         started, EwsRefusedError, SupersededError, and what `EwsReader.look` raises.
         """
         port = self._port
@@ -234,6 +250,8 @@ class Permission:
                 message = f"{port.config.name} does not start"
                 raise NotConfirmedError(message)
             if seen.status in _NOTHING_TO_START and not self._goes_on(seen):
+                break
+            if for_current and not self.waits_for_current:
                 break
             said_at, done = await self._say_start(talk, seen, still)
             if done is None:

@@ -263,7 +263,8 @@ class EwsReader(Charger):
         if box.restarts != self._restarts:
             self._restarts = box.restarts
             self.limiter.forget()
-            self.permission.forget()
+            # Flags may stay for long: what follows from a restart is seen.
+            self.permission.doubt()
         self.permission.watch(seen)
         self.seen = seen
         self._tell_events(before, seen)
