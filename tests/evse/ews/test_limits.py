@@ -1,6 +1,8 @@
 """The limit: never above the least of all, and believed when it is read back."""
 
 import asyncio
+from dataclasses import replace
+from zoneinfo import ZoneInfo
 
 import pytest
 
@@ -9,6 +11,7 @@ from custom_components.evse_bus.evse.errors import (
     RefusedOrderError,
 )
 from custom_components.evse_bus.evse.ews.answers import EwsRefusedError
+from custom_components.evse_bus.evse.ews.config import ews_config
 from custom_components.evse_bus.evse.model import (
     Command,
     Fault,
@@ -234,3 +237,22 @@ def test_orders_that_nobody_renews_fall_back_and_start_nothing() -> None:
         assert scene.box.ports[0].limit == 16
 
     play(EwsScene(lifetime=60.0, fail_safe=8.0), acts)
+
+
+def test_a_lower_installation_limit_does_not_wait_for_what_has_failed() -> None:
+    """Something else that failed just now, such as a clock that cannot be set."""
+
+    async def acts(scene: EwsScene) -> None:
+        await scene.charge()
+        port = scene.charger()
+        scene.box.unanswered.add("sc")
+        config = ews_config(port.config)
+        port.set_up(replace(config, time_zone=ZoneInfo("Asia/Tokyo")))
+        await scene.until(lambda: "sc" in [one.name for one in scene.line.sent])
+        await asyncio.sleep(2)
+        said_at = now()
+        port.set_up(replace(port.config, installation_limit=8.0))
+        await scene.until(lambda: scene.box.ports[0].limit == 8)
+        assert now() - said_at < 4
+
+    play(EwsScene(), acts)

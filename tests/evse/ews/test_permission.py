@@ -6,6 +6,7 @@ import pytest
 
 from custom_components.evse_bus.evse.errors import (
     NotAvailableError,
+    NotConfirmedError,
 )
 from custom_components.evse_bus.evse.ews.events import (
     ChargeEnded,
@@ -209,3 +210,18 @@ def test_a_start_at_the_box_against_a_pause_is_paused_again() -> None:
         )
     )
     play(scene, acts)
+
+
+def test_a_charge_that_the_box_aborts_has_not_started() -> None:
+    """A car that wants ventilation where there is none: code 8, state 0x60."""
+
+    async def acts(scene: EwsScene) -> None:
+        scene.box.ports[0].wants_fan = True
+        await scene.plug()
+        await scene.until(lambda: scene.status() == 0x30)
+        with pytest.raises(NotConfirmedError, match="aborted"):
+            await scene.charger().change_orders(ON)
+        assert scene.status() == 0x60
+        assert scene.charger().orders.allowed is None
+
+    play(EwsScene(), acts)

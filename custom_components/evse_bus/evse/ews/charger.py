@@ -58,6 +58,8 @@ class EwsPort(EwsReader):
         zone = ews_config(config).time_zone
         if zone != ews_config(self.config).time_zone:
             self.box.check_clock()
+        # A lower limit does not wait because something else has failed just now.
+        self._assert_after = -inf
         super().set_up(config)
 
     # -- The regular exchange ------------------------------------------------------

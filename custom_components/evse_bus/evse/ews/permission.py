@@ -225,8 +225,9 @@ class Permission:
 
         Where there is nothing to start, nothing is said. ``still`` is asked right
         before each word. ``for_current``: only a limit wants so, for the car that a
-        limit has stopped and no other. Raises NotAvailableError in a state in which nothing can be
-        started, EwsRefusedError, SupersededError, and what `EwsReader.look` raises.
+        limit has stopped and no other. Raises NotAvailableError in a state in which
+        nothing can be started, NotConfirmedError when it does not start or is aborted
+        at once, EwsRefusedError, SupersededError, and what `EwsReader.look` raises.
         """
         port = self._port
         patience = talk.now + READY_PATIENCE
@@ -248,6 +249,9 @@ class Permission:
                 continue
             if sends == SENDS:
                 message = f"{port.config.name} does not start"
+                raise NotConfirmedError(message)
+            if sends and seen.status == ABORTED:
+                message = f"{port.config.name}: the box has aborted the charge"
                 raise NotConfirmedError(message)
             if seen.status in _NOTHING_TO_START and not self._goes_on(seen):
                 break
