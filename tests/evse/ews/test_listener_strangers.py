@@ -24,6 +24,8 @@ from .dialling import (
 
 pytestmark = pytest.mark.usefixtures("socket_enabled")
 
+RECORD = bytes.fromhex("02 000b 49 6966 00 0000000000000000 4d")
+
 
 def test_addresses_that_may_not_connect() -> None:
     async def scene() -> None:
@@ -60,7 +62,7 @@ def test_silence_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
         bytes(2000),
         b"\x02\x04\x11Cid" + bytes(1200),
         b"\x02\xff\xffAid" + b"\x02\x00" * 1000,
-        bytes.fromhex("02 000b 49 6966 00 0000000000000000 4d") * 1000,
+        RECORD * 1000,
     ],
     ids=["http", "zeros", "over-long", "longest", "records"],
 )
@@ -70,6 +72,38 @@ def test_garbage_ends_a_connection(data: bytes) -> None:
             with stranger(made) as client:
                 await asyncio.get_running_loop().sock_sendall(client, data)
                 assert await goes(client, 1.5)
+
+    run(scene)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"\x02\x04\x00Aid" + RECORD,
+        b"\x02\x04\x00Aid" * 10 + RECORD,
+        b"\x02\x04\x00Aid" + RECORD[:-1] + b"\0",
+        b"\x02",
+    ],
+    ids=["nested", "nested deeply", "broken", "beginnings"],
+)
+def test_much_garbage_at_once_holds_up_nobody(data: bytes) -> None:
+    async def scene() -> None:
+        loop = asyncio.get_running_loop()
+        async with server() as made:
+            [listening_at] = made._server.sockets  # type: ignore[union-attr]
+            listening_at.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+            with stranger(made) as client:
+                client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
+                # All of it is there before anybody looks.
+                client.send(data * ((1 << 18) // len(data)))
+                begun, longest = loop.time(), 0.0
+                gone = asyncio.create_task(goes(client))
+                while not gone.done():
+                    await asyncio.sleep(0)
+                    now = loop.time()
+                    begun, longest = now, max(longest, now - begun)
+                assert await gone
+            assert longest < 0.4
 
     run(scene)
 

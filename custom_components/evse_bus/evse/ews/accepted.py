@@ -25,6 +25,8 @@ MOST_NOISE: Final = LONGEST_FRAME
 """Bytes that belong to no message, between two answers: more end a connection."""
 MOST_BYTES: Final = 8 * LONGEST_FRAME
 """Bytes of any kind between two answers: more end a connection."""
+_PIECE: Final = 256
+"""So many bytes are looked at before they are counted."""
 
 
 class Connection(asyncio.Protocol):
@@ -204,11 +206,16 @@ class AcceptedLine(Line):
 
     def received(self, data: bytes) -> None:
         """Take bytes of the connection; too many that answer nothing end it."""
-        self._received(data)
-        if self.statistics.bytes_in - self._bytes_before > MOST_BYTES:
-            self.end("too many bytes")
-        elif self._noise() - self._noise_before > MOST_NOISE:
-            self.end("no message in so many bytes")
+        # Much may come at once, and looking for messages in all of it takes long:
+        # garbage is looked at only until it is known to be too much.
+        for at in range(0, len(data), _PIECE):
+            if self._connection is None:
+                return
+            self._received(data[at : at + _PIECE])
+            if self.statistics.bytes_in - self._bytes_before > MOST_BYTES:
+                self.end("too many bytes")
+            elif self._noise() - self._noise_before > MOST_NOISE:
+                self.end("no message in so many bytes")
 
     @override
     def answered(self) -> None:
