@@ -6,6 +6,7 @@ from homeassistant.config_entries import ConfigEntryState, ConfigSubentry
 from homeassistant.const import EVENT_HOMEASSISTANT_STARTED
 from homeassistant.core import CoreState
 from homeassistant.data_entry_flow import FlowResultType, UnknownFlow
+from homeassistant.helpers.discovery_flow import DISCOVERY_FLOW_DISPATCHER
 import pytest
 
 from custom_components.evse_bus.discovery import MOST_OFFERS
@@ -163,15 +164,24 @@ async def test_firmware_that_is_no_firmware_is_no_link(hass: HomeAssistant) -> N
             flow.abort()
 
 
+@pytest.mark.parametrize("starting", [False, True], ids=["running", "starting"])
 async def test_many_serial_numbers_are_not_that_many_offers(
-    hass: HomeAssistant,
+    hass: HomeAssistant, *, starting: bool
 ) -> None:
+    if starting:
+        hass.set_state(CoreState.starting)
     async with listening(hass) as entry:
         for number in range(MOST_OFFERS + 4):
             stranger = Stranger(serial=f"{number:012d}", firmware="X", peer=None)
             listener_of(entry).on_stranger(stranger)
+        if starting:
+            # Home Assistant would keep an offer for each until it has started.
+            dispatcher = hass.data.get(DISCOVERY_FLOW_DISPATCHER)
+            assert dispatcher is None or not dispatcher.pending_flows
+            hass.set_state(CoreState.running)
+            hass.bus.async_fire(EVENT_HOMEASSISTANT_STARTED)
         await hass.async_block_till_done(wait_background_tasks=True)
-        assert len(offers(hass)) == MOST_OFFERS
+        assert len(offers(hass)) == (0 if starting else MOST_OFFERS)
 
 
 @pytest.mark.parametrize("meanwhile", ["nothing", "set up", "listener removed"])

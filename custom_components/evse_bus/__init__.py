@@ -18,7 +18,11 @@ from homeassistant.helpers.typing import ConfigType
 
 from .const import DOMAIN
 from .coordinator import BusCoordinator, EvseBusConfigEntry
-from .discovery import async_follow_ignored, async_listener_gone
+from .discovery import (
+    async_follow_ignored,
+    async_listener_gone,
+    async_offer_when_started,
+)
 from .errors import not_ready
 from .evse.errors import LineError
 from .lines import ListenerLines
@@ -71,6 +75,7 @@ async def async_setup_entry(hass: HomeAssistant, entry: EvseBusConfigEntry) -> b
     if isinstance(coordinator.lines, ListenerLines):
         listener = coordinator.lines.listener
         entry.async_on_unload(async_follow_ignored(hass, entry, listener))
+        entry.async_on_unload(async_offer_when_started(hass, entry, listener))
 
     async def follow_time_zone(_event: Event[Any]) -> None:
         await coordinator.async_match_subentries()

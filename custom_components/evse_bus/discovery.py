@@ -7,11 +7,12 @@ from homeassistant.config_entries import (
     SOURCE_INTEGRATION_DISCOVERY,
     signal_discovered_config_entry_removed,
 )
-from homeassistant.core import CALLBACK_TYPE, callback
+from homeassistant.core import CALLBACK_TYPE, CoreState, callback
 from homeassistant.data_entry_flow import UnknownFlow
 from homeassistant.helpers import discovery_flow
 from homeassistant.helpers.discovery_flow import DiscoveryKey
 from homeassistant.helpers.dispatcher import async_dispatcher_connect
+from homeassistant.helpers.start import async_at_started
 
 from .const import DOMAIN
 
@@ -40,6 +41,9 @@ def async_wants_to_connect(
     hass: HomeAssistant, entry: ConfigEntry, stranger: Stranger
 ) -> None:
     """Offer a box that has dialled; it may be added, or ignored."""
+    if hass.state is not CoreState.running:
+        # Home Assistant would keep any number of offers until it has started.
+        return
     unique_id = box_unique_id(stranger.serial)
     flows = hass.config_entries.flow.async_progress_by_handler(
         DOMAIN, include_uninitialized=True, match_context=dict(_OFFERED)
@@ -59,6 +63,23 @@ def async_wants_to_connect(
         # By this we are told when it is no longer ignored.
         discovery_key=DiscoveryKey(domain=DOMAIN, key=unique_id, version=1),
     )
+
+
+@callback
+def async_offer_when_started(
+    hass: HomeAssistant, entry: ConfigEntry, listener: Listener
+) -> CALLBACK_TYPE:
+    """Offer the boxes that have dialled while Home Assistant was starting.
+
+    Returns what ends this.
+    """
+
+    @callback
+    def started(_hass: HomeAssistant) -> None:
+        for stranger in listener.strangers:
+            async_wants_to_connect(hass, entry, stranger)
+
+    return async_at_started(hass, started)
 
 
 @callback
