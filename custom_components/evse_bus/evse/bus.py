@@ -28,6 +28,7 @@ from .jobs import Job, JobQueue, Later, Step
 from .line import Line
 from .listeners import Observed
 from .model import OrderChange, Persistence
+from .quota import Quota
 from .schedule import Kind, Slot, choose
 from .serving import serve
 
@@ -43,6 +44,9 @@ _LOST: Final = {
 }
 _BACK: Final = {False: "%s: the port is back", True: "%s: connected again"}
 """By whether the other end opens the line."""
+MOST_LOST: Final = 20
+LOST_WINDOW: Final = 3600.0
+"""So many losses are told in so many seconds: who dials can come and go all day."""
 STOP_PATIENCE: Final = 6.0
 """Longest time a stop waits for a conversation begun (waking a car: 3 s), s."""
 
@@ -72,6 +76,9 @@ class Bus(Observed):
         self.connected = False
         """The port is open."""
         self._was_open = False
+        self._losses = Quota(MOST_LOST, LOST_WINDOW)
+        self._told_as = logging.WARNING
+        """How the last loss was logged, and its end will be."""
         self.shared: object | None = None
         """What its chargers know together, where they are connectors of one box."""
         self._jobs = JobQueue()
@@ -405,8 +412,10 @@ class Bus(Observed):
         self.updated()
 
     def _on_lost(self, error: LineLostError) -> None:
+        told = self._losses.take(self.now)
+        self._told_as = logging.WARNING if told else logging.DEBUG
         lost = _LOST[self.line.opened_by_peer]
-        _LOGGER.warning(lost, self.name, error)
+        _LOGGER.log(self._told_as, lost, self.name, error)
         self.connected = False
         self.wire.fail(error)
         self._jobs.fail_all(error)
@@ -442,7 +451,8 @@ class Bus(Observed):
                 pause = min(pause * 2, REOPEN_LIMIT)
                 continue
             if self._was_open:
-                _LOGGER.warning(_BACK[self.line.opened_by_peer], self.name)
+                back = _BACK[self.line.opened_by_peer]
+                _LOGGER.log(self._told_as, back, self.name)
                 self.wire.statistics.reopened += 1
             self._on_open()
             return True

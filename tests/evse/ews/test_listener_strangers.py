@@ -6,6 +6,8 @@ import socket
 
 import pytest
 
+from custom_components.evse_bus.evse import bus as bus_module
+from custom_components.evse_bus.evse.bus import MOST_LOST
 from custom_components.evse_bus.evse.ews import listener as listening
 from tests.virtual.ews_box import EwsBox as VirtualBox
 
@@ -141,3 +143,29 @@ def test_who_says_nothing_does_not_keep_boxes_out(
                 one.close()
 
     run(scene)
+
+
+def test_who_comes_and_goes_does_not_fill_the_log(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """With the number of a box that is away anybody is taken for it."""
+    monkeypatch.setattr(bus_module, "REOPEN_FIRST", 0.01)
+    cycles = MOST_LOST + 10
+
+    async def scene() -> None:
+        async with server() as made, expected(made) as bus:
+            with dialling(made) as first_one:
+                await until(lambda: bus.connected)
+                with dialling(made):
+                    for cycle in range(1, cycles + 1):
+                        await until(lambda: bus.connected)
+                        seconds = made.statistics.seconds
+                        await until(lambda n=seconds: made.statistics.seconds > n)
+                        bus.line.end("it goes")
+                        await until(lambda n=cycle: bus.line.statistics.lost >= n)
+            assert first_one.attempts
+
+    run(scene)
+    told = [one.getMessage() for one in caplog.records if one.levelname == "WARNING"]
+    for words in ("was lost", "connected again", "connected and answers"):
+        assert 0 < sum(words in one for one in told) <= MOST_LOST

@@ -15,11 +15,12 @@ from ipaddress import IPv4Network, IPv6Network
 import logging
 from typing import Final
 
-from ..bus import Bus
+from ..bus import LOST_WINDOW, MOST_LOST, Bus
 from ..errors import EvseError, LineError, PortBusyError, PortMissingError
 from ..exchange import Talk, Wire
 from ..framing import Frame
 from ..line import line_error
+from ..quota import Quota
 from ..statistics import ChargerStatistics
 from .accepted import AcceptedLine, Address, Connection
 from .charger import EwsPort
@@ -106,6 +107,7 @@ class Listener:
         self._tasks: set[asyncio.Task[None]] = set()
         self._asking: set[str] = set()
         self._warned: set[str] = set()
+        self._warnings = Quota(MOST_LOST, LOST_WINDOW)
 
     # -- Life ------------------------------------------------------------------------
 
@@ -301,7 +303,8 @@ class Listener:
     def _refuse(self, stranger: Stranger, bus: Bus, connection: Connection) -> None:
         self.statistics.seconds += 1
         connection.abort()
-        if stranger.serial in self._warned:
+        now = asyncio.get_running_loop().time()
+        if stranger.serial in self._warned or not self._warnings.take(now):
             return
         self._warned.add(stranger.serial)
         message = "%s says that it is %s, which is connected and answers"
