@@ -105,7 +105,8 @@ def test_the_numbers_of_the_listener() -> None:
     page = words("docs/ews.md")
     assert f"{FIRST_PORT} is offered if it is free" in page
     assert (
-        f"within {IDENTIFY_TIME:g} s end, at most {MOST_UNIDENTIFIED} wait at once"
+        f"within {IDENTIFY_TIME:g} s end, at most {MOST_UNIDENTIFIED} (and one for "
+        "each box that is set up) wait at once"
     ) in page
     assert f"drops the connection after {COMMAND_TIMEOUT:g} s" in page
 

@@ -35,12 +35,13 @@ def test_addresses_that_may_not_connect() -> None:
             with stranger(made) as client:
                 assert await goes(client)
             assert made.statistics.not_allowed == 1
-        async with (
-            server(allowed=(ip_network("127.0.0.0/8"),)) as made,
-            expected(made) as bus,
-        ):
-            with dialling(made):
-                await until(lambda: has_reading(bus))
+        for allowed in ("127.0.0.0/8", "::ffff:127.0.0.0/104", "::ffff:127.0.0.1"):
+            async with (
+                server(allowed=(ip_network(allowed),)) as made,
+                expected(made) as bus,
+            ):
+                with dialling(made):
+                    await until(lambda known=bus: has_reading(known))
 
     run(scene)
 

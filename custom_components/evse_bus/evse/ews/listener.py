@@ -43,6 +43,8 @@ MOST_STRANGERS: Final = 8
 """Connections of boxes that are not set up, at once."""
 STRANGER_TIME: Final = 40.0
 """Such a connection is kept for so long, s: hung up on, it would dial all the time."""
+_MAPPED: Final = 96
+"""Length of what stands before an address of IPv4 that is written as one of IPv6."""
 PROOF_TIME: Final = 10.0
 """Longest time for a connected box to show that it is still there, s."""
 
@@ -92,7 +94,7 @@ class Listener:
         """
         self.host = host
         self.port = port
-        self.allowed = tuple(allowed)
+        self.allowed = tuple(map(_plain, allowed))
         self.on_stranger = on_stranger
         self.statistics = ListenerStatistics()
         self._server: asyncio.Server | None = None
@@ -155,7 +157,7 @@ class Listener:
 
         Connections from elsewhere end at once, also those of boxes that are set up.
         """
-        self.allowed = tuple(networks)
+        self.allowed = tuple(map(_plain, networks))
         for connection in (*self._unidentified, *self._identified):
             if not self._is_allowed(connection.peer):
                 self.statistics.not_allowed += 1
@@ -349,6 +351,14 @@ async def _identify(connection: Connection) -> Stranger:
     return Stranger(
         serial=status.serial, firmware=status.firmware, peer=connection.peer
     )
+
+
+def _plain(network: Network) -> Network:
+    """Return a network of IPv4 as one, also if it is written in the way of IPv6."""
+    mapped = getattr(network.network_address, "ipv4_mapped", None)
+    if mapped is None or network.prefixlen < _MAPPED:
+        return network
+    return IPv4Network((mapped, network.prefixlen - _MAPPED))
 
 
 def _ask_now(bus: Bus) -> None:
