@@ -3,12 +3,16 @@
 import asyncio
 from ipaddress import ip_network
 import socket
+import time
 
 import pytest
 
 from custom_components.evse_bus.evse import bus as bus_module
 from custom_components.evse_bus.evse.bus import MOST_LOST
 from custom_components.evse_bus.evse.ews import listener as listening
+from custom_components.evse_bus.evse.ews.accepted import AcceptedLine
+from custom_components.evse_bus.evse.ews.info import KEYS
+from custom_components.evse_bus.evse.ews.session import MOST_KEYS
 from tests.virtual.ews_box import EwsBox as VirtualBox
 
 from .dialling import (
@@ -16,6 +20,7 @@ from .dialling import (
     SERIAL,
     dialling,
     expected,
+    first,
     goes,
     has_reading,
     run,
@@ -170,3 +175,27 @@ def test_who_comes_and_goes_does_not_fill_the_log(
     told = [one.getMessage() for one in caplog.records if one.levelname == "WARNING"]
     for words in ("was lost", "connected again", "connected and answers"):
         assert 0 < sum(words in one for one in told) <= MOST_LOST
+
+
+def test_keys_that_nobody_can_press_are_not_told() -> None:
+    """Each would be an event: a flood of them would keep Home Assistant busy."""
+    record = bytes.fromhex("02 000b 49 6966 00 ffffffffffffffff 4d")
+    told: list[object] = []
+
+    async def scene() -> None:
+        async with server() as made, expected(made) as bus:
+            with dialling(made):
+                await until(lambda: has_reading(bus))
+                first(bus).subscribe_events(told.append)
+                line, wire = bus.line, bus.wire.statistics
+                assert isinstance(line, AcceptedLine)
+                begun = time.monotonic()
+                for _ in range(5):
+                    replies = wire.replies
+                    line.received(record * 500)
+                    assert line.is_open
+                    await until(lambda n=replies: wire.replies > n)
+                windows = time.monotonic() - begun + 1
+            assert KEYS <= len(told) <= MOST_KEYS * windows
+
+    run(scene)

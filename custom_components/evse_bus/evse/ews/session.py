@@ -7,6 +7,7 @@ that comes late must not be taken for one to a later command (answers have no nu
 but they come in their order).
 """
 
+import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime, tzinfo
@@ -16,6 +17,7 @@ from typing import Final
 
 from ..errors import ExchangeError, LineError, ReplyTimeoutError
 from ..exchange import Talk
+from ..quota import Quota
 from ..turns import Turns
 from .answers import answer, confirmed, decode_firmware_id
 from .box import BoxFlags, BoxStatus, decode_box
@@ -33,6 +35,8 @@ from .timing import (
     PARAMETERS_RETRY,
 )
 
+MOST_KEYS: Final = 100
+"""Keys pressed or released in a second: nobody does more, and each is an event."""
 _OTHER_TRY: Final = 3
 """Every so many tries the other reading of the checksum is tried."""
 
@@ -66,6 +70,7 @@ class EwsBox:
     def __init__(self) -> None:
         """Nothing is known before it answers."""
         self.events = Events()
+        self._keys = Quota(MOST_KEYS, 1.0)
         self.clock: Callable[[], datetime] = partial(datetime.now, UTC)
         """The right time."""
         self.heard_at = -inf
@@ -331,8 +336,10 @@ class EwsBox:
         if Change.CARD in info.changes:
             self._card_changed = True
             self.status_due = -inf
+        now = asyncio.get_running_loop().time()
         for key in info.key_events:
-            self.events.tell(key)
+            if self._keys.take(now):
+                self.events.tell(key)
 
     # -- Its clock -----------------------------------------------------------------
 
