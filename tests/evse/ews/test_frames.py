@@ -71,6 +71,13 @@ def test_what_is_private_is_not_logged(command: CommandId) -> None:
     assert redacted(raw) == raw[:6] + bytes(len(raw) - 6)
 
 
+def test_addresses_of_the_network_are_not_logged() -> None:
+    """Whatever command tells them: ``rg`` of a box with DHCP as well as ``ru``."""
+    address = bytes((192, 0, 2, 17))
+    for command in (CommandId.READ_DHCP, CommandId.READ_USER, CommandId.WRITE_USER):
+        assert address not in redacted(answer(command, address * 7))
+
+
 def test_what_is_not_private_is_logged_as_it_is() -> None:
     for raw in (INFO, answer("sl", b"\x05"), ASKED[Bcc.ALL], answer("zz")):
         assert redacted(raw) == raw

@@ -88,6 +88,7 @@ PRIVATE: Final = frozenset(
         CommandId.READ_PORTS,
         CommandId.READ_DETAILS,
         CommandId.READ_CARDS,
+        CommandId.READ_DHCP,
         CommandId.READ_INSTALLATION,
         CommandId.READ_SYSTEM,
         CommandId.READ_BOX,
