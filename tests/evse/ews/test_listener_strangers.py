@@ -156,6 +156,7 @@ def test_who_comes_and_goes_does_not_fill_the_log(
 ) -> None:
     """With the number of a box that is away anybody is taken for it."""
     monkeypatch.setattr(bus_module, "REOPEN_FIRST", 0.01)
+    monkeypatch.setattr(listening, "PROOF_PAUSE", 0.0)
     cycles = MOST_LOST + 10
 
     async def scene() -> None:
@@ -197,5 +198,25 @@ def test_keys_that_nobody_can_press_are_not_told() -> None:
                     await until(lambda n=replies: wire.replies > n)
                 windows = time.monotonic() - begun + 1
             assert KEYS <= len(told) <= MOST_KEYS * windows
+
+    run(scene)
+
+
+def test_a_box_is_not_asked_all_the_time_whether_it_is_there() -> None:
+    box = VirtualBox(serial=SERIAL)
+
+    async def scene() -> None:
+        async with server() as made, expected(made) as bus:
+            with dialling(made, box):
+                await until(lambda: has_reading(bus))
+                with dialling(made):
+                    await until(lambda: made.statistics.seconds > 1)
+                    before, refused = len(box.commands), made.statistics.seconds
+                    await asyncio.sleep(2.0)
+                    assert made.statistics.seconds > refused
+                    asked = [one.name for one in box.commands[before:]]
+            # Polls come every 0.5 s, and one a second to find out.
+            assert asked.count("rc") <= 8
+            assert made.statistics.replaced == 0
 
     run(scene)

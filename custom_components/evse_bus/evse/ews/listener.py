@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import errno
 from ipaddress import IPv4Network, IPv6Network
 import logging
+from math import inf
 from typing import Final
 
 from ..bus import LOST_WINDOW, MOST_LOST, Bus
@@ -43,10 +44,12 @@ MOST_STRANGERS: Final = 8
 """Connections of boxes that are not set up, at once."""
 STRANGER_TIME: Final = 40.0
 """Such a connection is kept for so long, s: hung up on, it would dial all the time."""
-_MAPPED: Final = 96
-"""Length of what stands before an address of IPv4 that is written as one of IPv6."""
 PROOF_TIME: Final = 10.0
 """Longest time for a connected box to show that it is still there, s."""
+PROOF_PAUSE: Final = 1.0
+"""Shortest time between two such questions to one box, s."""
+_MAPPED: Final = 96
+"""Length of what stands before an address of IPv4 that is written as one of IPv6."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,6 +111,7 @@ class Listener:
         self._timers: dict[Connection, asyncio.TimerHandle] = {}
         self._tasks: set[asyncio.Task[None]] = set()
         self._asking: set[str] = set()
+        self._asked_at: dict[str, float] = {}
         self._warned: set[str] = set()
         self._warnings = Quota(MOST_LOST, LOST_WINDOW)
 
@@ -291,6 +295,7 @@ class Listener:
             return False
         self._asking.add(serial)
         try:
+            await self._pause_asking(serial)
             _ask_now(bus)
             alive = await line.answers(PROOF_TIME)
         finally:
@@ -301,6 +306,13 @@ class Listener:
         self.statistics.replaced += 1
         line.end("another connection has its number, and this one does not answer")
         return connection.is_open
+
+    async def _pause_asking(self, serial: str) -> None:
+        """Wait: whoever dials all the time does not keep the box busy with us."""
+        loop = asyncio.get_running_loop()
+        before = self._asked_at.get(serial, -inf)
+        await asyncio.sleep(before + PROOF_PAUSE - loop.time())
+        self._asked_at[serial] = loop.time()
 
     def _refuse(self, stranger: Stranger, bus: Bus, connection: Connection) -> None:
         self.statistics.seconds += 1
