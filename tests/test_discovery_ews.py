@@ -9,6 +9,7 @@ from homeassistant.data_entry_flow import FlowResultType, UnknownFlow
 from homeassistant.helpers.discovery_flow import DISCOVERY_FLOW_DISPATCHER
 import pytest
 
+from custom_components.evse_bus.diagnostics import async_get_config_entry_diagnostics
 from custom_components.evse_bus.discovery import MOST_OFFERS
 from custom_components.evse_bus.evse.ews import Stranger
 from tests.common import bus_entry, get_entity, wait_for_state, wait_until
@@ -224,6 +225,10 @@ async def test_ignored_box_is_not_offered_until_it_is_no_longer_ignored(
             # The frontend lists all entries, this one with them.
             assert ignored.as_json_fragment
             assert not ignored.supports_options
+            assert not ignored.supported_subentry_types
+            assert await async_get_config_entry_diagnostics(hass, ignored) == {
+                "set_up": {}
+            }
             # It is in nobody's way when a port is chosen.
             flow = await Flow.add_bus(hass)
             await flow.submit({"protocol": "abl"})

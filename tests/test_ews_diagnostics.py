@@ -5,6 +5,7 @@ import logging
 import socket
 from typing import Any
 
+from homeassistant.config_entries import ConfigEntryDisabler
 from homeassistant.core import HomeAssistant
 from homeassistant.helpers import device_registry as dr
 from homeassistant.helpers.json import JSONEncoder
@@ -181,6 +182,26 @@ def assert_log_private(caplog: pytest.LogCaptureFixture) -> None:
         # What the user calls it is said to the user.
         if one != "Millers":
             assert one not in ours, one
+
+
+async def test_one_that_is_disabled_tells_how_it_is_set_up(
+    hass: HomeAssistant, device_registry: dr.DeviceRegistry
+) -> None:
+    entry = MockConfigEntry(
+        domain=DOMAIN,
+        data={"protocol": "ews_network", "host": HOST, "port": 4712},
+        disabled_by=ConfigEntryDisabler.USER,
+    )
+    entry.add_to_hass(hass)
+    device = device_registry.async_get_or_create(
+        config_entry_id=entry.entry_id, identifiers={(DOMAIN, entry.entry_id)}
+    )
+    set_up = {"protocol": "ews_network", "host": "**REDACTED**", "port": 4712}
+    for told in (
+        await async_get_config_entry_diagnostics(hass, entry),
+        await async_get_device_diagnostics(hass, entry, device),
+    ):
+        assert told == {"set_up": set_up}
 
 
 async def test_each_device_tells_of_itself(hass: HomeAssistant) -> None:

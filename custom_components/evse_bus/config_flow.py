@@ -81,6 +81,9 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
         cls, config_entry: ConfigEntry
     ) -> dict[str, type[ConfigSubentryFlow]]:
         """Return what can be added to a bus."""
+        # A box that is ignored is an entry, too: one without anything in it.
+        if CONF_PROTOCOL not in config_entry.data:
+            return {}
         return {SUBENTRY_CHARGER: ChargerSubentryFlow}
 
     @classmethod
@@ -88,7 +91,6 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
     @override
     def async_supports_options_flow(cls, config_entry: ConfigEntry) -> bool:
         """Return whether it listens: only then there is something to restrict."""
-        # A box that is ignored is an entry, too: one without anything in it.
         return CONF_PROTOCOL in config_entry.data and (
             protocol_of(config_entry.data).dials_in
         )

@@ -38,10 +38,13 @@ async def async_get_config_entry_diagnostics(
     entry: EvseBusConfigEntry,
 ) -> dict[str, Any]:
     """Return a bus, its last frames and its chargers."""
+    set_up = async_redact_data(dict(entry.data), _PRIVATE)
+    if not _was_set_up(entry):
+        return {"set_up": set_up}
     coordinator = entry.runtime_data
     units = coordinator.units.values()
     data = {
-        "set_up": async_redact_data(dict(entry.data), _PRIVATE),
+        "set_up": set_up,
         "master": _master(coordinator),
         "chargers": [_charger(coordinator, unit) for unit in units],
     }
@@ -56,6 +59,11 @@ async def async_get_config_entry_diagnostics(
             ],
         }
     return data | _bus(coordinator, lines.only, list(units)) if lines.only else data
+
+
+def _was_set_up(entry: EvseBusConfigEntry) -> bool:
+    """Return whether there is more to tell: not of one that is disabled or ignored."""
+    return hasattr(entry, "runtime_data")
 
 
 def _bus(
@@ -83,6 +91,8 @@ async def async_get_device_diagnostics(
     device: DeviceEntry | ChildDeviceEntry,
 ) -> dict[str, Any]:
     """Return one charger and the bus's last frames; for the bus: all."""
+    if not _was_set_up(entry):
+        return await async_get_config_entry_diagnostics(hass, entry)
     coordinator = entry.runtime_data
     keys = {key for domain, key in device.identifiers if domain == DOMAIN}
     units = tuple(coordinator.units.values())
