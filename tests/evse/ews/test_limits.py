@@ -239,13 +239,15 @@ def test_orders_that_nobody_renews_fall_back_and_start_nothing() -> None:
     play(EwsScene(lifetime=60.0, fail_safe=8.0), acts)
 
 
-def test_a_lower_installation_limit_does_not_wait_for_what_has_failed() -> None:
+def test_a_lower_installation_limit_does_not_wait_for_what_has_failed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Something else that failed just now, such as a clock that cannot be set."""
+    monkeypatch.setitem(COMMANDS, "sc", lambda _box, _parameters: b"\1")
 
     async def acts(scene: EwsScene) -> None:
         await scene.charge()
         port = scene.charger()
-        scene.box.unanswered.add("sc")
         config = ews_config(port.config)
         port.set_up(replace(config, time_zone=ZoneInfo("Asia/Tokyo")))
         await scene.until(lambda: "sc" in [one.name for one in scene.line.sent])

@@ -250,12 +250,7 @@ class Permission:
             if sends == SENDS:
                 message = f"{port.config.name} does not start"
                 raise NotConfirmedError(message)
-            if sends and seen.status == ABORTED:
-                message = f"{port.config.name}: the box has aborted the charge"
-                raise NotConfirmedError(message)
-            if seen.status in _NOTHING_TO_START and not self._goes_on(seen):
-                break
-            if for_current and not self.waits_for_current:
+            if self._nobody_waits(seen, said=sends > 0, for_current=for_current):
                 break
             said_at, done = await self._say_start(talk, seen, still)
             if done is None:
@@ -271,6 +266,18 @@ class Permission:
         if talk.now >= until:
             message = f"{self._port.config.name} is still starting up"
             raise NotAvailableError(message)
+
+    def _nobody_waits(self, seen: PortStatus, *, said: bool, for_current: bool) -> bool:
+        """Return whether there is nothing to start.
+
+        Raises NotConfirmedError where the box has aborted what was ``said`` to start.
+        """
+        if said and seen.status == ABORTED:
+            message = f"{self._port.config.name}: the box has aborted the charge"
+            raise NotConfirmedError(message)
+        if for_current and not self.waits_for_current:
+            return True
+        return seen.status in _NOTHING_TO_START and not self._goes_on(seen)
 
     def _goes_on(self, seen: PortStatus) -> bool:
         """Return whether a charge stands here that we have paused, perhaps."""
