@@ -41,6 +41,7 @@ class Wire:
         self.sent_at: float | None = None
         """Loop time at which the last request had left; ``None``: it did not."""
         self._framer = framer
+        self._heard_at = -inf
         self._pending: _PendingReply | None = None
         line.on_data = self._on_data
 
@@ -80,7 +81,7 @@ class Wire:
         await self._silence()
         data = request() if callable(request) else request
         loop = asyncio.get_running_loop()
-        self._framer.reset()
+        self._forget_what_has_begun()
         bad, noise = self._framer.bad, self._framer.noise
         started = loop.time()
         sent = self.line.write(data, reply_may_equal=reply_may_equal)
@@ -125,7 +126,7 @@ class Wire:
         self.sent_at = None
         await self._silence()
         data = request() if callable(request) else request
-        self._framer.reset()
+        self._forget_what_has_begun()
         sent = self.line.write(data)
         self.sent_at = sent
         self.frames.add(Direction.OUT, self._framer.shown(data))
@@ -148,7 +149,17 @@ class Wire:
                 raise LineBusyError(message)
             await asyncio.sleep(wait)
 
+    def _forget_what_has_begun(self) -> None:
+        """Forget a frame begun before we speak, but for one that may be unasked.
+
+        A serial port gives it in lumps, and what it tells is told once.
+        """
+        now = asyncio.get_running_loop().time()
+        if not self._framer.unasked or now - self._heard_at > self.timing.gap:
+            self._framer.reset()
+
     def _on_data(self, data: bytes) -> None:
+        self._heard_at = asyncio.get_running_loop().time()
         framer = self._framer
         bad, noise = framer.bad, framer.noise
         frames = framer.feed(data)

@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,6 +63,9 @@ class Frame(ABC):
 
 class Framer[F: Frame](ABC):
     """Finds frames in a stream of bytes; keeps what is left for the next call."""
+
+    unasked: ClassVar[bool] = False
+    """Frames come at any moment, also while we begin to speak."""
 
     def __init__(self) -> None:
         """Start with nothing heard."""

@@ -45,6 +45,30 @@ def test_a_record_at_every_position_of_an_answer(name: str) -> None:
     play(EwsScene(ports=(1,)), acts)
 
 
+@pytest.mark.parametrize("name", ["rc", "rd"])
+def test_a_record_that_has_begun_when_the_next_command_goes(name: str) -> None:
+    """A serial port gives its bytes in lumps, and what it is told is told once."""
+    length = {"rc": 115, "rd": 63}[name]
+
+    async def acts(scene: EwsScene) -> None:
+        scene.line.lumps = 0
+        for come in range(1, 16):
+            infos = scene.charger().box.changes
+            begun = InfoMix("after", cut=length + come, pause=0.02)
+            scene.box.mix_info(*([InfoMix("none")] if name == "rd" else []), begun)
+            scene.charger().ask_now()
+            # After rc comes rd; after that, what else waits.
+            scene.charger(2).ask_now()
+            await asyncio.sleep(0.6)
+            assert scene.charger().box.changes == infos + 1, come
+        assert scene.charger().statistics.timeouts == 0
+        assert scene.charger().available
+        assert scene.bus.wire.statistics.bad_frames == 0
+        assert scene.bus.wire.statistics.noise_bytes == 0
+
+    play(EwsScene(), acts)
+
+
 @pytest.mark.parametrize("where", ["before", "after"])
 @pytest.mark.parametrize("cut", [1, 3, 8, 15, 16, 17, 20])
 def test_a_record_beside_the_answer_to_an_order(where: str, cut: int) -> None:

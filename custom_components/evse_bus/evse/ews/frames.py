@@ -7,7 +7,7 @@ record begin with two letters that name it (manual, 3.2.2, 3.2.3).
 
 from dataclasses import dataclass, field
 from enum import Enum, IntEnum, StrEnum
-from typing import Final, override
+from typing import ClassVar, Final, override
 
 from ..errors import RefusedOrderError
 from ..framing import Frame, Framer
@@ -186,6 +186,8 @@ class EwsFramer(Framer[EwsFrame]):
     inside shows that the one begun will never end. Debug messages and those of other
     applications are skipped whole.
     """
+
+    unasked: ClassVar = True
 
     def __init__(self) -> None:
         """Start with nothing heard."""
