@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from custom_components.evse_bus.evse.ews.events import CardPresented
+from custom_components.evse_bus.evse.ews.events import CardPresented, StartRequested
 from custom_components.evse_bus.evse.ews.info import KeyEvent
 from custom_components.evse_bus.evse.ews.status import StartRelease
 from custom_components.evse_bus.evse.model import (
@@ -114,6 +114,30 @@ def test_a_record_is_followed_by_a_poll_at_once() -> None:
         await scene.until(lambda: scene.connector().start_requested)
         assert now() - begin < 0.1
         assert scene.charger().seen.start is StartRelease.REQUESTED  # type: ignore[union-attr]
+
+    play(EwsScene(), acts)
+
+
+@pytest.mark.parametrize("port", [1, 2])
+def test_a_record_is_heard_for_both_ports_while_commands_never_end(port: int) -> None:
+    async def acts(scene: EwsScene) -> None:
+        await scene.plug(port)
+        asked = scene.charger(3 - port)
+        over = False
+
+        async def ask() -> None:
+            while not over:
+                await asked.services.read_cards()
+
+        async with asyncio.TaskGroup() as group:
+            for _ in range(4):
+                group.create_task(ask())
+            await asyncio.sleep(3)
+            scene.box.press_key(port, 1)
+            took = await scene.until(lambda: scene.connector(port).start_requested)
+            over = True
+        assert took < 0.2
+        assert any(isinstance(one, StartRequested) for one in scene.events)
 
     play(EwsScene(), acts)
 

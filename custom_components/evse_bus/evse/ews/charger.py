@@ -5,6 +5,7 @@ whenever ``rd`` tells another one; a car that charges against the orders is paus
 nothing is ever started by itself. PROTOCOLS.md, 4; docs/ews-protocol.md.
 """
 
+from contextlib import suppress
 from functools import partial
 from math import inf
 from typing import override
@@ -222,7 +223,17 @@ class EwsPort(EwsReader):
             raise
         self.heard(talk.now)
         self.plan(talk.now)
+        self._tell_others()
         return later
+
+    def _tell_others(self) -> None:
+        """Let the other port take what the box told: its own turn may be far away."""
+        if self.bus is None or not self.box.known or not self.box.ports:
+            return
+        for other in self.bus.chargers.values():
+            if other is not self and isinstance(other, EwsPort) and other.available:
+                with suppress(EvseError):
+                    other.take()
 
 
 async def _nothing(_talk: Talk) -> None:
