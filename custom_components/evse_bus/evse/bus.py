@@ -27,8 +27,8 @@ from .framing import Frame, Framer, Timing
 from .jobs import Job, JobQueue, Later, Step
 from .line import Line
 from .listeners import Observed
+from .losses import Losses
 from .model import OrderChange, Persistence
-from .quota import Quota
 from .schedule import Kind, Slot, choose
 from .serving import serve
 
@@ -38,15 +38,6 @@ REOPEN_FIRST: Final = 1.0
 """First pause before a lost port is opened again, s; doubles."""
 REOPEN_LIMIT: Final = 30.0
 """Longest such pause, s."""
-_LOST: Final = {
-    False: "%s: the port was lost (%s), trying again",
-    True: "%s: the connection was lost (%s), waiting for another",
-}
-_BACK: Final = {False: "%s: the port is back", True: "%s: connected again"}
-"""By whether the other end opens the line."""
-MOST_LOST: Final = 20
-LOST_WINDOW: Final = 3600.0
-"""So many losses are told in so many seconds: who dials can come and go all day."""
 STOP_PATIENCE: Final = 6.0
 """Longest time a stop waits for a conversation begun (waking a car: 3 s), s."""
 
@@ -76,9 +67,7 @@ class Bus(Observed):
         self.connected = False
         """The port is open."""
         self._was_open = False
-        self._losses = Quota(MOST_LOST, LOST_WINDOW)
-        self._told_as = logging.WARNING
-        """How the last loss was logged, and its end will be."""
+        self._losses = Losses(opened_by_peer=line.opened_by_peer)
         self.shared: object | None = None
         """What its chargers know together, where they are connectors of one box."""
         self._jobs = JobQueue()
@@ -412,10 +401,7 @@ class Bus(Observed):
         self.updated()
 
     def _on_lost(self, error: LineLostError) -> None:
-        told = self._losses.take(self.now)
-        self._told_as = logging.WARNING if told else logging.DEBUG
-        lost = _LOST[self.line.opened_by_peer]
-        _LOGGER.log(self._told_as, lost, self.name, error)
+        self._losses.lost(self.name, error, self.now)
         self.connected = False
         self.wire.fail(error)
         self._jobs.fail_all(error)
@@ -451,8 +437,7 @@ class Bus(Observed):
                 pause = min(pause * 2, REOPEN_LIMIT)
                 continue
             if self._was_open:
-                back = _BACK[self.line.opened_by_peer]
-                _LOGGER.log(self._told_as, back, self.name)
+                self._losses.back(self.name)
                 self.wire.statistics.reopened += 1
             self._on_open()
             return True

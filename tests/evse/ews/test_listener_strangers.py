@@ -8,11 +8,11 @@ import time
 import pytest
 
 from custom_components.evse_bus.evse import bus as bus_module
-from custom_components.evse_bus.evse.bus import MOST_LOST
 from custom_components.evse_bus.evse.ews import listener as listening
 from custom_components.evse_bus.evse.ews.accepted import AcceptedLine
 from custom_components.evse_bus.evse.ews.info import KEYS
 from custom_components.evse_bus.evse.ews.session import MOST_KEYS
+from custom_components.evse_bus.evse.losses import MOST_LOST
 from tests.virtual.ews_box import EwsBox as VirtualBox
 
 from .dialling import (

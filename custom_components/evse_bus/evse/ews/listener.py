@@ -16,11 +16,12 @@ import logging
 from math import inf
 from typing import Final
 
-from ..bus import LOST_WINDOW, MOST_LOST, Bus
+from ..bus import Bus
 from ..errors import EvseError, LineError, PortBusyError, PortMissingError
 from ..exchange import Talk, Wire
 from ..framing import Frame
 from ..line import line_error
+from ..losses import LOST_WINDOW, MOST_LOST
 from ..quota import Quota
 from ..statistics import ChargerStatistics
 from .accepted import AcceptedLine, Address, Connection
