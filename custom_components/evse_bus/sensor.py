@@ -1,14 +1,16 @@
 """Sensors: what chargers say, and what the bus counts."""
 
-from collections.abc import Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from math import isfinite
 from typing import Any, TypeGuard, override
 
 from homeassistant.components.sensor import (
     RestoreSensor,
     SensorEntity,
+    SensorEntityDescription,
     SensorExtraStoredData,
 )
 from homeassistant.const import Platform
@@ -17,8 +19,10 @@ from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
 from homeassistant.util import dt as dt_util
 
 from .coordinator import (
+    BUS,
     STATISTICS,
     BusCoordinator,
+    Context,
     EvseBusConfigEntry,
 )
 from .energy import MeterTotal, SummedTotal
@@ -30,8 +34,6 @@ from .entity import (
     add_charger_entities,
     supported,
 )
-from .evse.bus import Bus
-from .evse.ews import Listener
 from .evse.model import Capability, Fault
 from .lines import ListenerLines
 from .sensor_counts import (
@@ -40,7 +42,6 @@ from .sensor_counts import (
     CONNECTED_BOXES,
     LISTENER_SENSORS,
     BusSensorDescription,
-    ListenerSensorDescription,
     StatisticDescription,
 )
 from .sensor_tables import (
@@ -68,14 +69,17 @@ async def async_setup_entry(
     coordinator = entry.runtime_data
     if coordinator.bus is not None:
         async_add_entities(
-            BusSensor(coordinator, description, coordinator.bus)
+            BusSensor(
+                coordinator, description, partial(description.value, coordinator.bus)
+            )
             for description in BUS_SENSORS
         )
     if isinstance(lines := coordinator.lines, ListenerLines):
-        async_add_entities([BoxesSensor(coordinator, lines)])
+        boxes = BusSensor(coordinator, CONNECTED_BOXES, lambda: lines.connected, BUS)
+        async_add_entities([boxes])
         async_add_entities(
-            ListenerSensor(coordinator, description, lines.listener)
-            for description in LISTENER_SENSORS
+            BusSensor(coordinator, counted, partial(counted.value, lines.listener))
+            for counted in LISTENER_SENSORS
         )
     add_charger_entities(Platform.SENSOR, entry, async_add_entities, _sensors)
 
@@ -86,7 +90,10 @@ def _sensors(coordinator: BusCoordinator, unit: ChargerUnit) -> Iterable[SensorE
     for description in supported(unit, CHARGER_SENSORS):
         yield ChargerSensor(coordinator, unit, description)
     for statistic in CHARGER_STATISTICS:
-        yield ChargerStatistic(coordinator, unit, statistic)
+        # Another charger may be behind it after a changed set-up.
+        yield ChargerStatistic(
+            coordinator, unit, statistic, partial(_counted, unit, statistic)
+        )
     if Capability.FAULTS in charger.capabilities:
         yield FaultSensor(coordinator, unit, FAULT)
     for number in sorted(unit.numbers):
@@ -104,7 +111,23 @@ def _line_sensors(
     """Return what is counted of the line that a box has for itself."""
     if unit.leads and coordinator.bus is None:
         for description in BUS_SENSORS:
-            yield LineSensor(coordinator, unit, description)
+            yield ChargerStatistic(
+                coordinator,
+                unit,
+                description,
+                partial(_counted_of_line, unit, description),
+                whole=True,
+            )
+
+
+def _counted(unit: ChargerUnit, description: StatisticDescription) -> float | None:
+    return description.value(unit.charger)
+
+
+def _counted_of_line(
+    unit: ChargerUnit, description: BusSensorDescription
+) -> float | None:
+    return description.value(unit.bus)
 
 
 class _ValueSensor(EvseBusEntity, SensorEntity):
@@ -122,54 +145,23 @@ class _ValueSensor(EvseBusEntity, SensorEntity):
 
 
 class BusSensor(BusEntity, _ValueSensor):
-    """A count of the bus of a port."""
-
-    def __init__(
-        self, coordinator: BusCoordinator, description: BusSensorDescription, bus: Bus
-    ) -> None:
-        """Be told from time to time."""
-        super().__init__(coordinator, description, STATISTICS)
-        self._value = description.value
-        self._bus = bus
-
-    @override
-    def value(self) -> str | float | None:
-        """Return what was counted."""
-        return self._value(self._bus)
-
-
-class BoxesSensor(BusEntity, _ValueSensor):
-    """How many of the boxes of a listener are connected."""
-
-    def __init__(self, coordinator: BusCoordinator, lines: ListenerLines) -> None:
-        """Be told when one comes or goes."""
-        super().__init__(coordinator, CONNECTED_BOXES)
-        self._lines = lines
-
-    @override
-    def value(self) -> int:
-        """Return how many there are."""
-        return self._lines.connected
-
-
-class ListenerSensor(BusEntity, _ValueSensor):
-    """A count of a listener."""
+    """Something of a port's bus, or of a listener."""
 
     def __init__(
         self,
         coordinator: BusCoordinator,
-        description: ListenerSensorDescription,
-        listener: Listener,
+        description: SensorEntityDescription,
+        value: Callable[[], float | None],
+        context: Context = STATISTICS,
     ) -> None:
-        """Be told from time to time."""
-        super().__init__(coordinator, description, STATISTICS)
-        self._value = description.value
-        self._listener = listener
+        """Be told from time to time, or in another context."""
+        super().__init__(coordinator, description, context)
+        self._value = value
 
     @override
-    def value(self) -> str | float | None:
+    def value(self) -> float | None:
         """Return what was counted."""
-        return self._value(self._listener)
+        return self._value()
 
 
 class ChargerSensor(ChargerEntity, _ValueSensor):
@@ -192,17 +184,20 @@ class ChargerSensor(ChargerEntity, _ValueSensor):
 
 
 class ChargerStatistic(ChargerEntity, _ValueSensor):
-    """A count about a charger; there also when the charger does not answer."""
+    """A count about a charger or its line; there also when nobody answers."""
 
     def __init__(
         self,
         coordinator: BusCoordinator,
         unit: ChargerUnit,
-        description: StatisticDescription,
+        description: SensorEntityDescription,
+        value: Callable[[], float | None],
+        *,
+        whole: bool = False,
     ) -> None:
         """Be told from time to time."""
-        super().__init__(coordinator, unit, description, STATISTICS)
-        self._value = description.value
+        super().__init__(coordinator, unit, description, STATISTICS, whole=whole)
+        self._value = value
 
     @override
     def is_available(self) -> bool:
@@ -210,33 +205,9 @@ class ChargerStatistic(ChargerEntity, _ValueSensor):
         return True
 
     @override
-    def value(self) -> str | float | None:
+    def value(self) -> float | None:
         """Return what was counted."""
-        return self._value(self.charger)
-
-
-class LineSensor(ChargerEntity, _ValueSensor):
-    """A count of the line that a box has for itself."""
-
-    def __init__(
-        self,
-        coordinator: BusCoordinator,
-        unit: ChargerUnit,
-        description: BusSensorDescription,
-    ) -> None:
-        """Be told from time to time."""
-        super().__init__(coordinator, unit, description, STATISTICS, whole=True)
-        self._value = description.value
-
-    @override
-    def is_available(self) -> bool:
-        """Return true: a line that is down can still be told of."""
-        return True
-
-    @override
-    def value(self) -> str | float | None:
-        """Return what was counted."""
-        return self._value(self.unit.bus)
+        return self._value()
 
 
 class FaultSensor(ChargerEntity, SensorEntity):

@@ -225,3 +225,18 @@ def test_a_charge_that_the_box_aborts_has_not_started() -> None:
         assert scene.charger().orders.allowed is None
 
     play(EwsScene(), acts)
+
+
+def test_a_socket_that_may_never_charge_says_so() -> None:
+    """Mode 1 has 16 A or nothing, and the wiring has less."""
+
+    async def acts(scene: EwsScene) -> None:
+        await asyncio.sleep(10)
+        with pytest.raises(NotAvailableError, match="needs 16 A"):
+            await scene.charger().change_orders(ON)
+        assert scene.charger().orders.allowed is None
+        assert not scene.line.orders()
+        await scene.charger(2).change_orders(ON)
+
+    options = {"mode1": (True, False)}
+    play(EwsScene(installation=10.0, current=6.0, options=options), acts)

@@ -13,6 +13,7 @@ from typing import override
 from ..errors import (
     EvseError,
     ImplausibleReplyError,
+    NotAvailableError,
 )
 from ..exchange import Talk
 from ..framing import Frame
@@ -159,6 +160,7 @@ class EwsPort(EwsReader):
                 ours = self.sought(change).allowed is not False
                 async for pause in self.permission.pause(talk, for_current=ours):
                     yield pause
+                self._check_possible(change)
                 return
             async for pause in self.limiter.enforce(talk, lambda: self.sought(change)):
                 yield pause
@@ -176,6 +178,19 @@ class EwsPort(EwsReader):
                 yield pause
         finally:
             self.end(token)
+
+    def _check_possible(self, change: OrderChange) -> None:
+        """Raise NotAvailableError where charging was allowed, and can never begin.
+
+        A household socket has 16 A or nothing (2.2.1).
+        """
+        limits = self.limits
+        if change.allowed is True and limits.ceiling < limits.minimum:
+            message = (
+                f"{self.config.name} needs {limits.minimum:g} A, "
+                f"and no more than {limits.ceiling:g} A may be offered"
+            )
+            raise NotAvailableError(message)
 
     @override
     async def command(
