@@ -294,7 +294,9 @@ async def test_a_household_socket_on_a_small_fuse_never_charges(
     ) as (entry, bus):
         switch = await get_entity(hass, "switch", entry, "2_charging_allowed")
         await plug_in(bus, box, 2)
-        await call(hass, "switch.turn_on", switch)
+        with pytest.raises(HomeAssistantError, match="needs 16 A") as refused:
+            await call(hass, "switch.turn_on", switch)
+        assert refused.value.translation_key == "not_available"
         await polled(bus, box, 20)
         assert state_of(hass, switch) == "off"
         assert START not in orders(box, 2)

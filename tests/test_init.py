@@ -138,8 +138,9 @@ async def test_unloading_leaves_nothing_open(hass: HomeAssistant) -> None:
         assert entry.state is ConfigEntryState.NOT_LOADED
         assert not bus_tasks()
         assert not coordinator._listeners
-        assert open_files() <= before
+        # The other end sees it when the last of ours is closed.
         await bus.wait_for_async(lambda: not bus.connected)
+        assert open_files() <= before
 
 
 async def test_unloading_while_the_adapter_is_gone(hass: HomeAssistant) -> None:
