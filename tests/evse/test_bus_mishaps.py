@@ -7,9 +7,9 @@ import pytest
 
 from custom_components.evse_bus.evse.errors import LineLostError, NotAvailableError
 from custom_components.evse_bus.evse.exchange import Talk
-from custom_components.evse_bus.evse.jobs import Later
 from custom_components.evse_bus.evse.model import OrderChange, Orders
 from custom_components.evse_bus.evse.safety import clamp
+from custom_components.evse_bus.evse.turns import rest
 
 from .simulated import Scene, SimulatedCharger, SimulatedLine, simulate
 
@@ -18,15 +18,11 @@ class SlowCharger(SimulatedCharger):
     """Is sure of an order only in a second turn, as a box that takes its time."""
 
     @override
-    async def impose(  # type: ignore[override]
-        self, talk: Talk, orders: Orders, change: OrderChange
-    ) -> Later[None] | None:
-        async def verify(talk: Talk) -> None:
-            await self.say(talk, "V")
-
+    async def impose(self, talk: Talk, orders: Orders, change: OrderChange) -> None:
         orders = self.target(change)
         await self.say(talk, "W", int(clamp(orders, self.limits).current))
-        return Later(1.0, verify)
+        await rest(1.0)
+        await self.say(talk, "V")
 
 
 def slow(scene: Scene) -> SlowCharger:

@@ -12,7 +12,8 @@ that they hold for every protocol alike:
 
 from abc import ABC, abstractmethod
 import asyncio
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import partial
 import logging
 from math import inf
@@ -39,6 +40,7 @@ from .readings import ChargerInfo, ChargerReading
 from .safety import Setpoint, cautious, check_change, clamp, expired
 from .schedule import Kind, Slot
 from .statistics import ChargerStatistics
+from .turns import Conversation, in_turns
 
 if TYPE_CHECKING:
     from .bus import Bus
@@ -77,6 +79,7 @@ class Charger(Observed, ABC):
         self.commit: Callable[[Orders], Awaitable[None]] = _no_commit
         """Stores orders; awaited before a lowering is sent, after a raise."""
         self.slot = Slot(kind=Kind.PROBE)
+        self._conversations: set[object] = set()
         self.bus: Bus | None = None
         self._renewed: float | None = None
         self._clamped: tuple[tuple[Orders, Limits], Setpoint] | None = None
@@ -153,9 +156,7 @@ class Charger(Observed, ABC):
         """Have the regular exchange; may ask for a further turn."""
 
     @abstractmethod
-    async def impose(
-        self, talk: Talk, orders: Orders, change: OrderChange
-    ) -> Later[None] | None:
+    async def impose(self, talk: Talk, orders: Orders, change: OrderChange) -> None:
         """Make the charger follow these orders, through `clamp`; return when sure.
 
         They are what is `sought` by the change, which may be another one in a later turn.
@@ -166,6 +167,10 @@ class Charger(Observed, ABC):
         Raises NotConfirmedError when the charger does not follow, and what
         `Talk.exchange` raises.
         """
+
+    def turns(self, conversation: Conversation) -> Step[None]:
+        """Return the first turn of a conversation with this charger."""
+        return in_turns(conversation)
 
     @property
     @abstractmethod
@@ -208,6 +213,21 @@ class Charger(Observed, ABC):
         self.slot.ready = self.slot.due = min(self.slot.ready, soon)
         if self.bus is not None:
             self.bus.look_again()
+
+    @property
+    def busy(self) -> bool:
+        """Return whether a conversation is under way: then polls only read."""
+        return bool(self._conversations)
+
+    @contextmanager
+    def conversing(self) -> Iterator[None]:
+        """Note that a conversation is under way, until it ends or is cut short."""
+        token = object()
+        self._conversations.add(token)
+        try:
+            yield
+        finally:
+            self._conversations.discard(token)
 
     # -- What the bus tells ------------------------------------------------------
 
@@ -283,32 +303,19 @@ class Charger(Observed, ABC):
             merge_key=merge_key(checked),
             change=checked,
         )
-        job.step = partial(self._impose_job, job)
+        job.step = self.turns(partial(self._impose_job, job))
         await bus.submit(job)
 
-    async def _impose_job(self, job: Job, talk: Talk) -> Later[None] | None:
+    async def _impose_job(self, job: Job, talk: Talk) -> None:
+        """Impose an order change, and let it stand once it is confirmed."""
         change = job.change or OrderChange()
-        result = await self.impose(talk, self.sought(change), change)
-        return await self._imposed(change, result)
-
-    async def _imposed(
-        self, change: OrderChange, result: Later[None] | None
-    ) -> Later[None] | None:
-        """Let a confirmed change stand; until then, wait for what is to come later."""
-        if result is not None:
-            rest = result.step
-
-            async def go_on(talk: Talk) -> Later[None] | None:
-                return await self._imposed(change, await rest(talk))
-
-            return Later(result.pause, go_on, result.worst_case)
+        await self.impose(talk, self.sought(change), change)
         stands = self.target(change)
         changed = stands != self.orders
         self.orders = stands
         self.updated()
         if changed:
             await self._store(stands)
-        return None
 
     async def _store(self, orders: Orders) -> None:
         try:
@@ -438,8 +445,10 @@ class Charger(Observed, ABC):
             stop()
 
     def notice(self, fault: Fault, *, present: bool) -> None:
-        """Set or clear a fault that we noticed ourselves."""
-        self.noticed = self.noticed | {fault} if present else self.noticed - {fault}
+        """Set or clear a fault that we noticed ourselves, and tell of a change."""
+        if present != (fault in self.noticed):
+            self.noticed = self.noticed ^ {fault}
+            self.updated()
 
 
 async def _no_commit(_orders: Orders) -> None:

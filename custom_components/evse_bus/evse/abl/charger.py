@@ -5,25 +5,19 @@ back above the order (Icmax does not survive a power cycle), and permission is n
 given by ourselves. PROTOCOLS.md, 2.
 """
 
-from collections.abc import Callable
-from functools import partial
 from typing import Final, override
 
 from ..errors import (
-    ExchangeRefusedError,
     GarbledReplyError,
     NotAvailableError,
-    NotConfirmedError,
 )
 from ..exchange import Talk
 from ..jobs import Later
 from ..model import ChargerConfig, Command, Fault, OrderChange, Orders
 from ..safety import Setpoint, clamp
-from ..turns import Turns, in_turns
+from ..turns import in_turns
 from .commands import CommandSet
-from .dialogue import Debt
 from .duty import PAUSE, is_within
-from .exchanges import set_limit
 from .reader import AblReader
 from .registers import (
     Reading,
@@ -33,10 +27,6 @@ from .states import E0, SETUP
 
 GARBLED: Final = 3
 """Unreadable answers in a row that look like two boxes with one ID."""
-WRITES: Final = 2
-"""How often a limit is written until it must be read back."""
-SETTLING: Final = 0.25
-"""Time a box is given to follow a limit that is not read back at once, s."""
 
 
 class AblCharger(AblReader):
@@ -45,12 +35,8 @@ class AblCharger(AblReader):
     def __init__(self, config: ChargerConfig, orders: Orders) -> None:
         """Take the set-up; the box is not known before it answers."""
         super().__init__(config, orders)
-        self.owes: Debt | None = None
-        """A state that we brought about on the way, and have not ended yet."""
         self._commands = CommandSet(self)
         self._garbled = 0
-        self._conversations: set[object] = set()
-        self._confirmed: int | None = None
         self._limit_paused = False
         self._fell_back = False
 
@@ -77,17 +63,17 @@ class AblCharger(AblReader):
         except GarbledReplyError:
             self._garbled += 1
             if self._garbled >= GARBLED:
-                self.tell(Fault.DUPLICATE_ADDRESS, present=True)
+                self.notice(Fault.DUPLICATE_ADDRESS, present=True)
             raise
         self._garbled = 0
-        self.tell(Fault.DUPLICATE_ADDRESS, present=False)
+        self.notice(Fault.DUPLICATE_ADDRESS, present=False)
         await self.read_flags_if_due(talk, raw)
         self.take(raw, talk.now)
         return self._what_now(raw)
 
     def _what_now(self, raw: Reading) -> Later[None] | None:
         """Return what must be said because of a reading."""
-        if self._conversations:
+        if self.busy:
             return None
         if self.owes is not None:
             if self.owes.is_open(raw.state):
@@ -105,8 +91,8 @@ class AblCharger(AblReader):
         duty = limit_duty(self.setpoint)
         if not is_within(raw.duty, duty):
             return True
-        self._confirmed = duty
-        self.tell(Fault.LIMIT_NOT_TAKEN, present=False)
+        self.confirmed = duty
+        self.notice(Fault.LIMIT_NOT_TAKEN, present=False)
         if self.orders_expired and not self._fell_back:
             # The fail-safe may be the higher one: raised to once, and never in a box
             # that is paused or disabled.
@@ -118,14 +104,8 @@ class AblCharger(AblReader):
     # -- Orders ------------------------------------------------------------------
 
     @override
-    async def impose(
-        self, talk: Talk, orders: Orders, change: OrderChange
-    ) -> Later[None] | None:
-        return await in_turns(partial(self._impose, orders, change))(talk)
-
-    async def _impose(self, orders: Orders, change: OrderChange, talk: Talk) -> Turns:
-        token = self.begin()
-        try:
+    async def impose(self, talk: Talk, orders: Orders, change: OrderChange) -> None:
+        with self.conversing():
             await self.identify(talk)
             setpoint = clamp(orders, self.limits)
             # The user's pause goes out at once; else the box says what may be sent.
@@ -133,16 +113,13 @@ class AblCharger(AblReader):
                 await self.look(talk), setpoint, orders, change
             ):
                 return
-            async for pause in self.enforce(
+            await self.enforce(
                 talk,
                 lambda: clamp(self.sought(change), self.limits),
                 starts=change.allowed is True,
-            ):
-                yield pause
+            )
             self._limit_paused = setpoint.paused and orders.allowed is not False
             self._fell_back = False
-        finally:
-            self.end(token)
 
     def _may_write(
         self, raw: Reading, setpoint: Setpoint, orders: Orders, change: OrderChange
@@ -176,57 +153,21 @@ class AblCharger(AblReader):
             return lowers
         return lowers or asked or self._fell_back
 
-    async def _assert(self, talk: Talk) -> Turns:
+    async def _assert(self, talk: Talk) -> None:
         """Bring a box that stands above its orders down to them."""
-        token = self.begin()
-        try:
+        with self.conversing():
             await self.identify(talk)
             raw = self.raw or await self.look(talk)
             if not self._must_assert(raw):
                 # A command of the user came first and did it.
                 return
             duty = limit_duty(self.setpoint)
-            if duty == self._confirmed and not is_within(raw.duty, duty):
+            if duty == self.confirmed and not is_within(raw.duty, duty):
                 self.statistics.reasserted += 1
-            async for pause in self.enforce(talk, lambda: self.setpoint):
-                yield pause
+            await self.enforce(talk, lambda: self.setpoint)
             self._fell_back = self.orders_expired
             if self.setpoint.paused and self.effective_orders.allowed is not False:
                 self._limit_paused = True
-        finally:
-            self.end(token)
-
-    async def enforce(
-        self, talk: Talk, wanted: Callable[[], Setpoint], *, starts: bool = False
-    ) -> Turns:
-        """Write a set-point until it is read back, at it or below it.
-
-        ``starts``: a pause read back does not count as below. Raises
-        NotConfirmedError when the box does not follow, ExchangeRefusedError when it
-        says so.
-        """
-        for attempt in range(WRITES):
-            if attempt:
-                self.statistics.reasserted += 1
-            setpoint = wanted()
-            duty = limit_duty(setpoint)
-            try:
-                await set_limit(talk, self.config.address, setpoint)
-            except ExchangeRefusedError:
-                self.tell(Fault.LIMIT_NOT_TAKEN, present=True)
-                raise
-            for pause in (SETTLING, None):
-                raw = await self.look(talk)
-                still_paused = starts and raw.duty == PAUSE != duty
-                if is_within(raw.duty, duty) and not still_paused:
-                    self._confirmed = duty
-                    self.tell(Fault.LIMIT_NOT_TAKEN, present=False)
-                    return
-                if pause is not None:
-                    yield pause
-        self.tell(Fault.LIMIT_NOT_TAKEN, present=True)
-        message = f"{self.config.name} does not follow its limit"
-        raise NotConfirmedError(message)
 
     # -- Commands ----------------------------------------------------------------
 
@@ -238,13 +179,3 @@ class AblCharger(AblReader):
     ) -> None:
         conversation, persistence = self._commands.conversation(command, value)
         await self.run(in_turns(conversation), persistence=persistence)
-
-    def begin(self) -> object:
-        """Note that a conversation began: until it ends, polls only read."""
-        token = object()
-        self._conversations.add(token)
-        return token
-
-    def end(self, token: object) -> None:
-        """Note that a conversation is over."""
-        self._conversations.discard(token)

@@ -5,11 +5,9 @@ read, and decides. What a conversation has changed on its way (E0, E2) it change
 back, also when something fails.
 """
 
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
 
 from ..errors import (
     ExchangeRefusedError,
@@ -20,9 +18,10 @@ from ..errors import (
 )
 from ..exchange import Talk
 from ..model import Command, Persistence
-from ..turns import Turns
-from .dialogue import Debt, Dialogue
+from ..turns import Conversation, rest
+from .dialogue import Dialogue
 from .duty import PAUSE
+from .reader import AblReader, Debt
 from .registers import (
     ADDRESSES,
     StateCode,
@@ -30,9 +29,6 @@ from .registers import (
 )
 from .setup import Settings, SetUp
 from .states import B2, E0, E2, state_of
-
-if TYPE_CHECKING:
-    from .charger import AblCharger
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +41,7 @@ class _Busy:
 class CommandSet(Dialogue):
     """The commands of one charger; one at a time."""
 
-    def __init__(self, charger: AblCharger) -> None:
+    def __init__(self, charger: AblReader) -> None:
         """Take the charger, for its identity, its readings and its limit."""
         super().__init__(charger)
         self._set_up = SetUp(charger)
@@ -53,7 +49,7 @@ class CommandSet(Dialogue):
 
     def conversation(
         self, command: Command, value: object
-    ) -> tuple[Callable[[Talk], Turns], Persistence]:
+    ) -> tuple[Conversation, Persistence]:
         """Return what carries out a command, and how often it may be begun.
 
         Raises RefusedOrderError for a value that the command cannot have, and
@@ -64,7 +60,7 @@ class CommandSet(Dialogue):
 
     def _turns(
         self, command: Command, value: object
-    ) -> tuple[Callable[[Talk], Turns], Persistence]:
+    ) -> tuple[Conversation, Persistence]:
         match command:
             case Command.RESET:
                 return self._reset, Persistence.ONCE
@@ -90,62 +86,53 @@ class CommandSet(Dialogue):
         self._busy = None
 
     def _one_at_a_time(
-        self, command: Command | None, turns: Callable[[Talk], Turns]
-    ) -> Callable[[Talk], Turns]:
-        async def conversation(talk: Talk) -> Turns:
+        self, command: Command | None, turns: Conversation
+    ) -> Conversation:
+        async def conversation(talk: Talk) -> None:
             if self._busy is not None:
                 message = f"{self._charger.config.name} is busy: {self._busy.what}"
                 raise NotAvailableError(message)
-            token = self._charger.begin()
             self._busy = mine = _Busy(command or "tidying up")
             try:
-                async for pause in turns(talk):
-                    yield pause
+                with self._charger.conversing():
+                    await turns(talk)
             finally:
                 if self._busy is mine:
                     self._busy = None
-                self._charger.end(token)
                 self._charger.updated()
 
         return conversation
 
     # -- Outlet ------------------------------------------------------------------
 
-    async def _set_outlet(self, enabled: bool, talk: Talk) -> Turns:  # noqa: FBT001
-        async for pause in self._reach(talk):
-            yield pause
+    async def _set_outlet(self, enabled: bool, talk: Talk) -> None:  # noqa: FBT001
+        await self._reach(talk)
         reading = self._state()
         if enabled:
             if state_of(reading.state).outlet_enabled is not True:
                 if reading.state not in (E0, E2):
                     raise self._refuse_in(reading, "only E0 and E2 can be left")
-                async for pause in self._enable(talk):
-                    yield pause
+                await self._enable(talk)
             self._charger.owes = None
         else:
-            async for pause in self._disable(talk):
-                yield pause
+            await self._disable(talk)
 
-    async def _enable(self, talk: Talk) -> Turns:
+    async def _enable(self, talk: Talk) -> None:
         """Enable the outlet, with the limit that stands."""
         charger = self._charger
         paused = self._state().duty == PAUSE
-        async for pause in self._limit_first(talk):
-            yield pause
-        async for pause in self._reach_state(
+        await self._limit_first(talk)
+        await self._reach_state(
             talk, StateCode.A1, lambda now: now.state not in (E0, E2)
-        ):
-            yield pause
+        )
         if not paused and self._state().duty < limit_duty(charger.setpoint) != PAUSE:
             # Limits raised while the outlet was disabled have only been stored.
-            async for pause in charger.enforce(talk, lambda: charger.setpoint):
-                yield pause
+            await charger.enforce(talk, lambda: charger.setpoint)
 
     # -- Waking a car ------------------------------------------------------------
 
-    async def _wake(self, talk: Talk) -> Turns:
-        async for pause in self._reach(talk):
-            yield pause
+    async def _wake(self, talk: Talk) -> None:
+        await self._reach(talk)
         charger = self._charger
         reading = self._state()
         if reading.state != B2:
@@ -165,26 +152,23 @@ class CommandSet(Dialogue):
                     charger.owes = None
                     message = f"{charger.config.name} did not take E0"
                     raise NotConfirmedError(message)
-        yield self.pauses.wake
-        async for pause in self._give_back(talk):
-            yield pause
+        await rest(self.pauses.wake)
+        await self._give_back(talk)
 
-    def give_back(self, talk: Talk) -> Turns:
+    async def give_back(self, talk: Talk) -> None:
         """Finish what a command that was cut short has left undone."""
-        return self._one_at_a_time(None, self._give_back)(talk)
+        await self._one_at_a_time(None, self._give_back)(talk)
 
     # -- Reset -------------------------------------------------------------------
 
-    async def _reset(self, talk: Talk) -> Turns:
-        async for pause in self._reach(talk):
-            yield pause
+    async def _reset(self, talk: Talk) -> None:
+        await self._reach(talk)
         before = self._state()
         if before.state == E0:
             self._charger.owes = Debt(StateCode.E0)
         self._hold_polls(talk)
         confirmed = await self._say(talk, StateCode.RESET)
-        async for pause in self._after_reset(talk, was_disabled=before.state == E0):
-            yield pause
+        await self._after_reset(talk, was_disabled=before.state == E0)
         after = self._state()
         if not confirmed and (after.state, after.duty) == (before.state, before.duty):
             message = (

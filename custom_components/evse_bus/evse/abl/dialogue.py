@@ -7,7 +7,7 @@ read, and decides.
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Final
+from typing import ClassVar, Final
 
 from ..errors import (
     ExchangeError,
@@ -16,14 +16,12 @@ from ..errors import (
     ReplyTimeoutError,
 )
 from ..exchange import Talk
-from ..turns import Turns
+from ..turns import rest
 from .duty import is_within
 from .exchanges import set_state
+from .reader import AblReader
 from .registers import Reading, StateCode, limit_duty
 from .states import E0, E2, state_of
-
-if TYPE_CHECKING:
-    from .charger import AblCharger
 
 BOOT_LOOKS: Final = 10
 """How often a box that has been reset is looked for."""
@@ -47,29 +45,16 @@ class Pauses:
     """Between two looks at a state that is to be reached."""
 
 
-@dataclass(frozen=True, slots=True)
-class Debt:
-    """A state that a command brings about on its way, and what ends it."""
-
-    end: StateCode
-    state: int | None = None
-    """``None``: any but E0 (a disabled outlet that is being reset)."""
-
-    def is_open(self, state: int) -> bool:
-        """Return whether a box in this state still has to be led out of it."""
-        return state != E0 if self.state is None else state == self.state
-
-
 class Dialogue:
     """Steps that several commands share."""
 
     pauses: ClassVar = Pauses()
 
-    def __init__(self, charger: AblCharger) -> None:
+    def __init__(self, charger: AblReader) -> None:
         """Take the charger, for its identity, its readings and its limit."""
         self._charger = charger
 
-    async def _reach(self, talk: Talk) -> Turns:
+    async def _reach(self, talk: Talk) -> None:
         """Wake the box itself: nothing has been written, so asking again is safe."""
         for last in (False, False, True):
             try:
@@ -80,7 +65,7 @@ class Dialogue:
                     raise
             else:
                 return
-            yield self.pauses.retry
+            await rest(self.pauses.retry)
 
     def _state(self) -> Reading:
         """Return the last reading."""
@@ -109,7 +94,7 @@ class Dialogue:
 
     async def _reach_state(
         self, talk: Talk, code: StateCode, reached: Callable[[Reading], bool]
-    ) -> Turns:
+    ) -> None:
         """Write a state code and see that it works; again only if it was lost."""
         confirmed = await self._say(talk, code)
         for _ in range(LOOKS):
@@ -117,13 +102,13 @@ class Dialogue:
                 return
             if not confirmed:
                 confirmed = await self._say(talk, code)
-            yield self.pauses.verify
+            await rest(self.pauses.verify)
         if reached(await self._charger.look(talk)):
             return
         message = f"{self._charger.config.name} does not follow {code.name}"
         raise NotConfirmedError(message)
 
-    async def _after_reset(self, talk: Talk, *, was_disabled: bool) -> Turns:
+    async def _after_reset(self, talk: Talk, *, was_disabled: bool) -> None:
         """Wait for a box to come back; then nothing may be open that was closed.
 
         A reset ends in A1 with Idefault: neither the limit nor E0 has survived it.
@@ -132,7 +117,7 @@ class Dialogue:
         charger.forget()
         for look in range(BOOT_LOOKS):
             self._hold_polls(talk)
-            yield self.pauses.boot
+            await rest(self.pauses.boot)
             self._hold_polls(talk)
             try:
                 await charger.identify(talk)
@@ -141,31 +126,25 @@ class Dialogue:
             except ReplyTimeoutError:
                 if look == BOOT_LOOKS - 1:
                     raise
-        async for pause in self._limit_first(talk):
-            yield pause
+        await self._limit_first(talk)
         if was_disabled:
-            async for pause in self._disable(talk):
-                yield pause
+            await self._disable(talk)
         elif self._state().state != E2:
             charger.owes = None
 
-    async def _limit_first(self, talk: Talk) -> Turns:
+    async def _limit_first(self, talk: Talk) -> None:
         """Bring the limit down: enabled, a car may begin at once."""
         charger = self._charger
         if not is_within(self._state().duty, limit_duty(charger.setpoint)):
-            async for pause in charger.enforce(talk, lambda: charger.setpoint):
-                yield pause
+            await charger.enforce(talk, lambda: charger.setpoint)
 
-    async def _disable(self, talk: Talk) -> Turns:
+    async def _disable(self, talk: Talk) -> None:
         """Disable the outlet; from then on it is to be so."""
         if self._state().state != E0:
-            async for pause in self._reach_state(
-                talk, StateCode.E0, lambda now: now.state == E0
-            ):
-                yield pause
+            await self._reach_state(talk, StateCode.E0, lambda now: now.state == E0)
         self._charger.owes = None
 
-    async def _give_back(self, talk: Talk) -> Turns:
+    async def _give_back(self, talk: Talk) -> None:
         """End the state that we brought about; a lost exchange is tried again."""
         charger = self._charger
         debt = charger.owes
@@ -175,12 +154,11 @@ class Dialogue:
             with suppress(ExchangeError):
                 if debt.is_open((await charger.look(talk)).state):
                     if self._state().state == E0:
-                        async for pause in self._limit_first(talk):
-                            yield pause
+                        await self._limit_first(talk)
                     await self._say(talk, debt.end)
                     await charger.look(talk)
                 if not debt.is_open(self._state().state):
                     charger.owes = None
                     return
-            yield self.pauses.verify
+            await rest(self.pauses.verify)
         raise NotConfirmedError(f"{charger.config.name} does not leave its state")

@@ -4,6 +4,7 @@ Who answers is checked anew after each (re)connect and after each missed answer,
 before anything else is said. PROTOCOLS.md, 2.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, override
 
@@ -11,13 +12,17 @@ from ..charger import Charger
 from ..errors import (
     ExchangeRefusedError,
     GarbledReplyError,
+    NotConfirmedError,
     ReplyTimeoutError,
     WrongChargerError,
 )
 from ..exchange import Talk
 from ..framing import Timing
 from ..model import Capability, ChargerConfig, Fault, Limits, Orders, Phases
-from .exchanges import read
+from ..safety import Setpoint
+from ..turns import rest
+from .duty import PAUSE, is_within
+from .exchanges import read, set_limit
 from .readings import (
     EnergyEstimate,
     Told,
@@ -37,12 +42,15 @@ from .registers import (
     Flags,
     Info,
     Reading,
+    StateCode,
     decode_flags,
     decode_icmax,
     decode_info,
     decode_reading,
     decode_serial,
+    limit_duty,
 )
+from .states import E0
 
 TIMING: Final = Timing(
     # A box answers within some milliseconds; network adapters take longer.
@@ -56,6 +64,11 @@ FLAGS_INTERVAL: Final = 30.0
 """Time between two readings of the system flags, s."""
 FLAGS_MISSES: Final = 3
 """Flags left unanswered in a row until the old ones no longer count."""
+
+WRITES: Final = 2
+"""How often a limit is written until it must be read back."""
+SETTLING: Final = 0.25
+"""Time a box is given to follow a limit that is not read back at once, s."""
 
 _CAPABILITIES: Final = frozenset(
     {
@@ -94,6 +107,19 @@ class AblConfig(ChargerConfig):
             raise ValueError(message)
 
 
+@dataclass(frozen=True, slots=True)
+class Debt:
+    """A state that a command brings about on its way, and what ends it."""
+
+    end: StateCode
+    state: int | None = None
+    """``None``: any but E0 (a disabled outlet that is being reset)."""
+
+    def is_open(self, state: int) -> bool:
+        """Return whether a box in this state still has to be led out of it."""
+        return state != E0 if self.state is None else state == self.state
+
+
 class AblReader(Charger):
     """One ABL wallbox, as far as it is asked and not told."""
 
@@ -106,6 +132,10 @@ class AblReader(Charger):
         """What 0x002E told last, undecided."""
         self.tells_icmax: bool | None = None
         """Whether it knows register 0x000F; ``None``: not asked yet."""
+        self.owes: Debt | None = None
+        """A state that we brought about on the way, and have not ended yet."""
+        self.confirmed: int | None = None
+        """The duty cycle that was read back last, as it was written."""
         self._serial: str | None = None
         self._info: Info | None = None
         self._flags: Flags | None = None
@@ -186,12 +216,12 @@ class AblReader(Charger):
         serial = await self._read_serial(talk)
         expected = self.config.serial or self._serial
         if expected is not None and serial != expected:
-            self.tell(Fault.WRONG_CHARGER, present=True)
+            self.notice(Fault.WRONG_CHARGER, present=True)
             self.set_unavailable()
             found = serial or "no serial number"
             message = f"at device-ID {address} answers {found}, not {expected}"
             raise WrongChargerError(message, expected=expected, found=found)
-        self.tell(Fault.WRONG_CHARGER, present=False)
+        self.notice(Fault.WRONG_CHARGER, present=False)
         self._serial = serial
         self._info = info
         self._identified = True
@@ -286,8 +316,36 @@ class AblReader(Charger):
         self.tells_icmax = True
         self._icmax = decode_icmax(data)
 
-    def tell(self, fault: Fault, *, present: bool) -> None:
-        """Note a fault of our own finding, and tell the listeners of a change."""
-        if present != (fault in self.noticed):
-            self.notice(fault, present=present)
-            self.updated()
+    # -- What is written -------------------------------------------------------------
+
+    async def enforce(
+        self, talk: Talk, wanted: Callable[[], Setpoint], *, starts: bool = False
+    ) -> None:
+        """Write a set-point until it is read back, at it or below it.
+
+        ``starts``: a pause read back does not count as below. Raises
+        NotConfirmedError when the box does not follow, ExchangeRefusedError when it
+        says so.
+        """
+        for attempt in range(WRITES):
+            if attempt:
+                self.statistics.reasserted += 1
+            setpoint = wanted()
+            duty = limit_duty(setpoint)
+            try:
+                await set_limit(talk, self.config.address, setpoint)
+            except ExchangeRefusedError:
+                self.notice(Fault.LIMIT_NOT_TAKEN, present=True)
+                raise
+            for pause in (SETTLING, None):
+                raw = await self.look(talk)
+                still_paused = starts and raw.duty == PAUSE != duty
+                if is_within(raw.duty, duty) and not still_paused:
+                    self.confirmed = duty
+                    self.notice(Fault.LIMIT_NOT_TAKEN, present=False)
+                    return
+                if pause is not None:
+                    await rest(pause)
+        self.notice(Fault.LIMIT_NOT_TAKEN, present=True)
+        message = f"{self.config.name} does not follow its limit"
+        raise NotConfirmedError(message)

@@ -16,9 +16,10 @@ from ..errors import (
     ReplyTimeoutError,
 )
 from ..exchange import Talk
-from ..turns import Turns
-from .dialogue import BOOT_LOOKS, Debt, Dialogue
+from ..turns import rest
+from .dialogue import BOOT_LOOKS, Dialogue
 from .exchanges import configure, read
+from .reader import Debt
 from .registers import INFO, SERIAL, Reading, StateCode, decode_serial
 from .states import A1, E0, E2
 
@@ -35,11 +36,10 @@ class Settings:
 class SetUp(Dialogue):
     """The conversation that sets a box up."""
 
-    async def run(self, settings: Settings, talk: Talk) -> Turns:
+    async def run(self, settings: Settings, talk: Talk) -> None:
         """Set device-ID or settings: E2, 0x002C, reset; then see that it is so."""
         charger = self._charger
-        async for pause in self._reach(talk):
-            yield pause
+        await self._reach(talk)
         old = charger.config.address
         new = old if settings.device_id is None else settings.device_id
         if settings.device_id == old:
@@ -47,24 +47,19 @@ class SetUp(Dialogue):
         before = self._state()
         serial = self._check_ready(before)
         if new != old:
-            async for pause in self._make_sure_free(talk, new):
-                yield pause
+            await self._make_sure_free(talk, new)
         was_disabled = before.state == E0
         charger.owes = Debt(StateCode.E0) if was_disabled else Debt(StateCode.A1, E2)
         try:
-            async for pause in self._write(talk, settings, new):
-                yield pause
+            await self._write(talk, settings, new)
         except EvseError:
             # Out of the set-up mode again, whatever went wrong.
             with suppress(EvseError):
-                async for pause in self._give_back(talk):
-                    yield pause
+                await self._give_back(talk)
             raise
         charger.forget()
-        async for pause in self._move(talk, new, serial):
-            yield pause
-        async for pause in self._after_reset(talk, was_disabled=was_disabled):
-            yield pause
+        await self._move(talk, new, serial)
+        await self._after_reset(talk, was_disabled=was_disabled)
         await charger.read_flags(talk)
         self._check_settings(settings)
 
@@ -83,7 +78,7 @@ class SetUp(Dialogue):
             raise NotAvailableError(message)
         return serial
 
-    async def _make_sure_free(self, talk: Talk, address: int) -> Turns:
+    async def _make_sure_free(self, talk: Talk, address: int) -> None:
         """Raise DuplicateAddressError when somebody has that address already."""
         bus = self._charger.bus
         others = bus.chargers.values() if bus is not None else ()
@@ -96,19 +91,16 @@ class SetUp(Dialogue):
                 taken = True
             if not ask:
                 # A box asleep loses the first request.
-                yield self.pauses.retry
+                await rest(self.pauses.retry)
         if taken:
             message = f"device-ID {address} is taken already"
             raise DuplicateAddressError(message)
 
-    async def _write(self, talk: Talk, settings: Settings, new: int) -> Turns:
+    async def _write(self, talk: Talk, settings: Settings, new: int) -> None:
         self._hold_polls(talk)
-        async for pause in self._reach_state(
-            talk, StateCode.E2, lambda now: now.state == E2
-        ):
-            yield pause
+        await self._reach_state(talk, StateCode.E2, lambda now: now.state == E2)
         self._hold_polls(talk)
-        yield self.pauses.setup
+        await rest(self.pauses.setup)
         self._hold_polls(talk)
         write = partial(
             configure,
@@ -123,21 +115,21 @@ class SetUp(Dialogue):
         except ReplyTimeoutError:
             # It cannot be read before the reset; the same value twice is the same.
             await write()
-        yield self.pauses.setup
+        await rest(self.pauses.setup)
         self._hold_polls(talk)
         if not await self._say(talk, StateCode.RESET):
             with suppress(ReplyTimeoutError):
                 if (await self._charger.look(talk)).state == E2:
                     await self._say(talk, StateCode.RESET)
 
-    async def _move(self, talk: Talk, new: int, serial: str) -> Turns:
+    async def _move(self, talk: Talk, new: int, serial: str) -> None:
         """Find the box at its new address, by its serial number; then go there."""
         charger = self._charger
         if new == charger.config.address:
             return
         for _ in range(BOOT_LOOKS):
             self._hold_polls(talk)
-            yield self.pauses.boot
+            await rest(self.pauses.boot)
             self._hold_polls(talk)
             with suppress(ReplyTimeoutError):
                 found = decode_serial(await read(talk, new, SERIAL))

@@ -6,7 +6,6 @@ nothing is ever started by itself. PROTOCOLS.md, 4; docs/ews-protocol.md.
 """
 
 from contextlib import suppress
-from functools import partial
 from math import inf
 from typing import override
 
@@ -25,7 +24,7 @@ from ..model import (
     Orders,
 )
 from ..safety import clamp
-from ..turns import Turns, in_turns
+from ..turns import in_turns, rest
 from .commanding import conversation
 from .config import ews_config
 from .frames import EwsFrame
@@ -79,9 +78,8 @@ class EwsPort(EwsReader):
         self.take()
         return self._what_now(talk.now)
 
-    async def _meet(self, talk: Talk) -> Turns:
-        async for pause in self.ready(talk):
-            yield pause
+    async def _meet(self, talk: Talk) -> None:
+        await self.ready(talk)
         self.hurry()
 
     # -- What must be so ---------------------------------------------------------------
@@ -107,38 +105,27 @@ class EwsPort(EwsReader):
             or box.clock_is_wrong(zone, now)
         )
 
-    async def _tend(self, talk: Talk) -> Turns:
-        token = self.begin()
-        # Not again at once, whatever comes of it.
-        self._assert_after = talk.now + ASSERT_PAUSE
-        try:
-            async for pause in self._assert(talk):
-                yield pause
-        finally:
-            self.end(token)
+    async def _tend(self, talk: Talk) -> None:
+        with self.conversing():
+            # Not again at once, whatever comes of it.
+            self._assert_after = talk.now + ASSERT_PAUSE
+            await self._assert(talk)
         self._assert_after = -inf
 
-    async def _assert(self, talk: Talk) -> Turns:
+    async def _assert(self, talk: Talk) -> None:
         if self.permission.must_pause(self.setpoint):
             ours = self.effective_orders.allowed is not False
-            async for pause in self.permission.pause(talk, for_current=ours):
-                yield pause
-            yield 0.0
+            await self.permission.pause(talk, for_current=ours)
+            await rest(0.0)
         if self.limiter.must_assert():
             self.limiter.count()
-            async for pause in self.limiter.enforce(
-                talk, lambda: self.effective_orders
-            ):
-                yield pause
-            yield 0.0
-        async for pause in self.ready(talk):
-            yield pause
+            await self.limiter.enforce(talk, lambda: self.effective_orders)
+            await rest(0.0)
+        await self.ready(talk)
         box = self.box
         if talk.now >= box.parameters_due:
-            async for pause in box.read_parameters(talk):
-                yield pause
-            async for pause in self.ready(talk):
-                yield pause
+            await box.read_parameters(talk)
+            await self.ready(talk)
         zone = ews_config(self.config).time_zone
         if zone is not None and box.clock_is_wrong(zone, talk.now):
             await box.set_clock(talk, zone)
@@ -146,24 +133,15 @@ class EwsPort(EwsReader):
     # -- Orders ------------------------------------------------------------------------
 
     @override
-    async def impose(
-        self, talk: Talk, orders: Orders, change: OrderChange
-    ) -> Later[None] | None:
-        return await in_turns(partial(self._impose, change))(talk)
-
-    async def _impose(self, change: OrderChange, talk: Talk) -> Turns:
-        token = self.begin()
-        try:
-            async for pause in self.ready(talk):
-                yield pause
+    async def impose(self, talk: Talk, orders: Orders, change: OrderChange) -> None:
+        with self.conversing():
+            await self.ready(talk)
             if clamp(self.sought(change), self.limits).paused:
                 ours = self.sought(change).allowed is not False
-                async for pause in self.permission.pause(talk, for_current=ours):
-                    yield pause
+                await self.permission.pause(talk, for_current=ours)
                 self._check_possible(change)
                 return
-            async for pause in self.limiter.enforce(talk, lambda: self.sought(change)):
-                yield pause
+            await self.limiter.enforce(talk, lambda: self.sought(change))
             if not self.permission.may_start(change):
                 return
 
@@ -171,13 +149,10 @@ class EwsPort(EwsReader):
                 # Not where a pause came meanwhile: that one is on its way.
                 return not clamp(self.sought(change), self.limits).paused
 
-            yield 0.0
-            async for pause in self.permission.start(
+            await rest(0.0)
+            await self.permission.start(
                 talk, still, for_current=change.allowed is not True
-            ):
-                yield pause
-        finally:
-            self.end(token)
+            )
 
     def _check_possible(self, change: OrderChange) -> None:
         """Raise NotAvailableError where charging was allowed, and can never begin.

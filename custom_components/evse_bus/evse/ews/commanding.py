@@ -20,7 +20,7 @@ from ..errors import (
 )
 from ..exchange import Talk
 from ..model import Capability, Command
-from ..turns import Turns
+from ..turns import Conversation, rest
 from .answers import decode_reset
 from .commands import reset, start_stop, unlock
 from .frames import CommandId, Request
@@ -30,7 +30,7 @@ from .status import PortStatus, StartRelease
 from .timing import LOOK_AGAIN, SETTLING
 
 if TYPE_CHECKING:
-    from .charger import EwsPort
+    from .reader import EwsReader
 
 TRIES: Final = 10
 """How often an order is about to be said, and something happens at the box then."""
@@ -90,10 +90,10 @@ _OPTIMISED: Final[Mapping[bool, _Order]] = {
 
 
 def conversation(
-    port: EwsPort,
+    port: EwsReader,
     command: Command,
     value: bool | int | str | None,  # noqa: FBT001 - as `Charger.command`
-) -> Callable[[Talk], Turns] | None:
+) -> Conversation | None:
     """Return what carries a command out; ``None``: an EWS-Box has no such command.
 
     Raises RefusedOrderError for a value that cannot be.
@@ -109,7 +109,7 @@ def conversation(
     return None if order is None else partial(_give, port, command, order)
 
 
-async def _give(port: EwsPort, command: Command, order: _Order, talk: Talk) -> Turns:
+async def _give(port: EwsReader, command: Command, order: _Order, talk: Talk) -> None:
     """Give an order, and look until it is followed.
 
     Raises NotAvailableError where it may not be given, EwsRefusedError, and
@@ -119,8 +119,7 @@ async def _give(port: EwsPort, command: Command, order: _Order, talk: Talk) -> T
     patience = talk.now + SETTLING
     until, answered = -inf, True
     while True:
-        async for pause in port.ready(talk):
-            yield pause
+        await port.ready(talk)
         if order.unlocks and Capability.LOCK not in port.capabilities:
             message = f"{port.config.name} has no lock"
             raise NotAvailableError(message)
@@ -129,7 +128,7 @@ async def _give(port: EwsPort, command: Command, order: _Order, talk: Talk) -> T
         except ReplyTimeoutError:
             if talk.now >= max(until, patience):
                 raise
-            yield LOOK_AGAIN
+            await rest(LOOK_AGAIN)
             continue
         if order.done(seen) and (sends or order.unlocks):
             break
@@ -142,12 +141,12 @@ async def _give(port: EwsPort, command: Command, order: _Order, talk: Talk) -> T
                 answered = await _say(port, order.pick(seen), seen, talk)
                 sends += 1
                 until = talk.now + SETTLING
-        yield LOOK_AGAIN
+        await rest(LOOK_AGAIN)
     if order.unlocks and sends:
         port.permission.forget()
 
 
-async def _say(port: EwsPort, order: StartStop, seen: PortStatus, talk: Talk) -> bool:
+async def _say(port: EwsReader, order: StartStop, seen: PortStatus, talk: Talk) -> bool:
     """Say it; return whether it was answered.
 
     Raises SupersededError, and says nothing, when a record has come since the look.
@@ -171,14 +170,13 @@ async def _say(port: EwsPort, order: StartStop, seen: PortStatus, talk: Talk) ->
     return True
 
 
-async def _reset(port: EwsPort, talk: Talk) -> Turns:
+async def _reset(port: EwsReader, talk: Talk) -> None:
     """Restart the box; both ports forget their limits.
 
     Raises NotConfirmedError when nobody answers: it may have restarted all the same.
     """
     box = port.box
-    async for pause in port.ready(talk):
-        yield pause
+    await port.ready(talk)
     try:
         await box.ask(talk, CommandId.RESET, reset, decode_reset)
     except ReplyTimeoutError as error:

@@ -13,7 +13,7 @@ from ..errors import NotAvailableError, NotConfirmedError, ReplyTimeoutError
 from ..exchange import Talk
 from ..model import MINIMUM_CURRENT, CurrentLimit, Fault, Orders
 from ..safety import Setpoint, clamp
-from ..turns import Turns
+from ..turns import rest
 from .answers import EwsRefusedError
 from .commands import set_limit
 from .frames import CommandId, Request
@@ -94,7 +94,7 @@ class Limiter:
         port = self._port
         if self.must_assert() or port.permission.must_pause(port.setpoint):
             return
-        port.tell(Fault.LIMIT_NOT_TAKEN, present=False)
+        port.notice(Fault.LIMIT_NOT_TAKEN, present=False)
 
     def count(self) -> None:
         """Count a limit that stood, and is said again because the box is above it."""
@@ -103,7 +103,7 @@ class Limiter:
 
     # -- Saying it -----------------------------------------------------------------
 
-    async def enforce(self, talk: Talk, orders: Callable[[], Orders]) -> Turns:
+    async def enforce(self, talk: Talk, orders: Callable[[], Orders]) -> None:
         """Say the limit until it is read back, at it or below it.
 
         Raises NotConfirmedError when the box does not follow, EwsRefusedError when it
@@ -113,8 +113,7 @@ class Limiter:
         patience = talk.now + READY_PATIENCE
         sends = 0
         while sends < SENDS:
-            async for pause in port.ready(talk):
-                yield pause
+            await port.ready(talk)
             # The cable counts as well, and is seen right now only.
             seen = await port.look(talk)
             if self.wanted(orders()) is None:
@@ -125,20 +124,18 @@ class Limiter:
             except EwsRefusedError:
                 if seen.status == STARTING and talk.now < patience:
                     sends -= 1
-                    yield READY_PAUSE
+                    await rest(READY_PAUSE)
                     continue
-                yield 0.0
-                async for pause in self._after_refusal(talk):
-                    yield pause
+                await rest(0.0)
+                await self._after_refusal(talk)
                 raise
-            yield 0.0
+            await rest(0.0)
             for _ in range(LOOKS):
-                async for pause in port.ready(talk):
-                    yield pause
+                await port.ready(talk)
                 if await self._is_read_back(talk, said, answered=answered):
                     return
-                yield LOOK_AGAIN
-        port.tell(Fault.LIMIT_NOT_TAKEN, present=True)
+                await rest(LOOK_AGAIN)
+        port.notice(Fault.LIMIT_NOT_TAKEN, present=True)
         message = f"{port.config.name} does not follow its limit"
         raise NotConfirmedError(message)
 
@@ -185,14 +182,13 @@ class Limiter:
             return False
         self._confirmed = said
         self._other = (said, told)
-        port.tell(Fault.LIMIT_NOT_TAKEN, present=False)
+        port.notice(Fault.LIMIT_NOT_TAKEN, present=False)
         return True
 
-    async def _after_refusal(self, talk: Talk) -> Turns:
+    async def _after_refusal(self, talk: Talk) -> None:
         """Leave a box that refused at no more than was ordered: at 6 A, if need be."""
         port = self._port
-        async for pause in port.ready(talk):
-            yield pause
+        await port.ready(talk)
         wanted = self.wanted(port.effective_orders)
         told = self.told
         if wanted is None or told is None:
@@ -201,6 +197,6 @@ class Limiter:
             # It has a lower maximum than it tells: said again, it would refuse again.
             self._other = (int(wanted.current), told)
             return
-        port.tell(Fault.LIMIT_NOT_TAKEN, present=True)
+        port.notice(Fault.LIMIT_NOT_TAKEN, present=True)
         with suppress(EwsRefusedError):
             await self._say(talk, lambda: _LOWEST)

@@ -18,7 +18,7 @@ from ..errors import (
 from ..exchange import Talk
 from ..model import Fault, OrderChange
 from ..safety import Setpoint
-from ..turns import Turns
+from ..turns import rest
 from .answers import EwsRefusedError, Refusal
 from .commands import start_stop
 from .frames import CommandId, Request
@@ -146,7 +146,7 @@ class Permission:
 
     # -- Pausing -------------------------------------------------------------------
 
-    async def pause(self, talk: Talk, *, for_current: bool) -> Turns:
+    async def pause(self, talk: Talk, *, for_current: bool) -> None:
         """Stop a charge under way, and keep the cable locked.
 
         ``for_current``: only our limit of 0 A wants so. Raises NotConfirmedError when
@@ -157,19 +157,18 @@ class Permission:
         if not for_current:
             self.waits_for_current = False
         while True:
-            async for pause in port.ready(talk):
-                yield pause
+            await port.ready(talk)
             seen = await port.look_now(talk)
             if not self._runs(seen):
                 break
             if talk.now >= self._said_at + SETTLING:
                 if sends == SENDS:
-                    port.tell(Fault.LIMIT_NOT_TAKEN, present=True)
+                    port.notice(Fault.LIMIT_NOT_TAKEN, present=True)
                     message = f"{port.config.name} does not pause"
                     raise NotConfirmedError(message)
                 sends += 1
                 await self._say_pause(talk, seen)
-            yield LOOK_AGAIN
+            await rest(LOOK_AGAIN)
         if sends and self.paused is None and seen.status in AFTER_OUR_PAUSE:
             # The answer was lost, and it has followed.
             self.paused = True
@@ -200,7 +199,7 @@ class Permission:
             return
         except EwsRefusedError:
             self.paused = False
-            port.tell(Fault.LIMIT_NOT_TAKEN, present=True)
+            port.notice(Fault.LIMIT_NOT_TAKEN, present=True)
             raise
         self.paused = True
 
@@ -220,7 +219,7 @@ class Permission:
 
     async def start(
         self, talk: Talk, still: Callable[[], bool], *, for_current: bool
-    ) -> Turns:
+    ) -> None:
         """Let the car charge that waits, or that we have paused.
 
         Where there is nothing to start, nothing is said. ``still`` is asked right
@@ -234,18 +233,17 @@ class Permission:
         said_at: float | None = None
         sends = 0
         while True:
-            async for pause in port.ready(talk):
-                yield pause
+            await port.ready(talk)
             seen = await port.look_now(talk)
             settled = said_at is None or talk.now >= said_at + SETTLING
             if self._has_started(seen, settled=settled):
                 break
             if seen.status == STARTING:
                 self._check_patience(talk, patience)
-                yield READY_PAUSE
+                await rest(READY_PAUSE)
                 continue
             if not settled:
-                yield LOOK_AGAIN
+                await rest(LOOK_AGAIN)
                 continue
             if sends == SENDS:
                 message = f"{port.config.name} does not start"
@@ -256,10 +254,10 @@ class Permission:
             if done is None:
                 self._check_patience(talk, patience)
                 said_at = None
-                yield READY_PAUSE
+                await rest(READY_PAUSE)
                 continue
             sends += 1
-            yield LOOK_AGAIN
+            await rest(LOOK_AGAIN)
         self.waits_for_current = False
 
     def _check_patience(self, talk: Talk, until: float) -> None:

@@ -12,7 +12,6 @@ from ..charger import Charger
 from ..errors import NotAvailableError, WrongChargerError
 from ..exchange import Talk
 from ..model import Capability, ChargerConfig, Fault, Limits, Orders
-from ..turns import Turns
 from .accepted import AcceptedLine
 from .config import ews_config
 from .events import (
@@ -59,7 +58,6 @@ class EwsReader(Charger):
         self._own_box = EwsBox()
         self.permission = Permission(self)
         self.limiter = Limiter(self)
-        self._conversations: set[object] = set()
         self._assert_after = -inf
         self._charges = False
         self._running: PortStatus | None = None
@@ -199,20 +197,19 @@ class EwsReader(Charger):
 
     # -- Who it is, and what it says -------------------------------------------------
 
-    async def ready(self, talk: Talk) -> Turns:
+    async def ready(self, talk: Talk) -> None:
         """Make sure that we know whom we talk to.
 
         Raises WrongChargerError for another box, and what `EwsBox.read` raises.
         """
         box = self.box
         while not box.known or box.installation is None:
-            async for pause in box.meet(talk):
-                yield pause
+            await box.meet(talk)
         self._check_identity()
 
     def _check_identity(self) -> None:
         found, expected = self.box.serial, self.config.serial
-        self.tell(
+        self.notice(
             Fault.WRONG_CHARGER, present=expected is not None and found != expected
         )
         if expected is not None and found is not None and found != expected:
@@ -254,7 +251,7 @@ class EwsReader(Charger):
         self._check_identity()
         box = self.box
         installed = box.installation.ports if box.installation else self.port
-        self.tell(Fault.NO_SUCH_PORT, present=installed < self.port)
+        self.notice(Fault.NO_SUCH_PORT, present=installed < self.port)
         if len(box.ports) < self.port:
             self.set_unavailable()
             message = f"{self.config.name}: the box has no port {self.port}"
@@ -289,21 +286,6 @@ class EwsReader(Charger):
 
     # -- Conversations -----------------------------------------------------------------
 
-    @property
-    def busy(self) -> bool:
-        """Return whether a conversation is under way: then polls only read."""
-        return bool(self._conversations)
-
-    def begin(self) -> object:
-        """Note that a conversation began."""
-        token = object()
-        self._conversations.add(token)
-        return token
-
-    def end(self, token: object) -> None:
-        """Note that a conversation is over."""
-        self._conversations.discard(token)
-
     # -- Events and faults -------------------------------------------------------------
 
     def subscribe_events(self, listener: Listener) -> Callable[[], None]:
@@ -329,11 +311,3 @@ class EwsReader(Charger):
         elif is_on and not was_on and before is not None:
             # Else it may have begun before our time.
             events.tell(ChargeStarted(port=self.port))
-
-    # -- Faults of our own finding ---------------------------------------------------------
-
-    def tell(self, fault: Fault, *, present: bool) -> None:
-        """Note a fault, and tell the listeners of a change."""
-        if present != (fault in self.noticed):
-            self.notice(fault, present=present)
-            self.updated()

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 from ..errors import NotConfirmedError, RefusedOrderError, ReplyTimeoutError
 from ..exchange import Talk
 from ..jobs import Later
-from ..turns import Turns, in_turns
+from ..turns import in_turns, rest
 from .answers import decode_card_reader
 from .box import Dhcp, decode_dhcp
 from .cards import (
@@ -34,7 +34,7 @@ from .parameters import Block, Shown
 from .timing import LOOK_AGAIN
 
 if TYPE_CHECKING:
-    from .charger import EwsPort
+    from .reader import EwsReader
 
 LOOKS: Final = 5
 """How often something written is read back until it must stand there."""
@@ -45,7 +45,7 @@ LONGEST_READER_TIMEOUT: Final = 10
 class Services:
     """The services of one box, carried out in the turns of one of its ports."""
 
-    def __init__(self, port: EwsPort) -> None:
+    def __init__(self, port: EwsReader) -> None:
         """Take the port."""
         self._port = port
 
@@ -211,9 +211,8 @@ class Services:
         port = self._port
         done: list[T] = []
 
-        async def talks(talk: Talk) -> Turns:
-            async for pause in port.ready(talk):
-                yield pause
+        async def talks(talk: Talk) -> None:
+            await port.ready(talk)
             try:
                 done.append(await work(talk))
             except ReplyTimeoutError as error:
@@ -256,14 +255,12 @@ class Services:
         port = self._port
         told: list[T] = []
 
-        async def talks(talk: Talk) -> Turns:
-            async for pause in port.ready(talk):
-                yield pause
+        async def talks(talk: Talk) -> None:
+            await port.ready(talk)
             await write(talk)
             for _ in range(LOOKS):
-                yield LOOK_AGAIN
-                async for pause in port.ready(talk):
-                    yield pause
+                await rest(LOOK_AGAIN)
+                await port.ready(talk)
                 try:
                     found = await read(talk)
                 except ReplyTimeoutError:

@@ -18,7 +18,7 @@ from typing import Final
 from ..errors import ExchangeError, LineError, ReplyTimeoutError
 from ..exchange import Talk
 from ..quota import Quota
-from ..turns import Turns
+from ..turns import rest
 from .answers import answer, confirmed, decode_firmware_id
 from .box import BoxFlags, BoxStatus, decode_box
 from .commands import read, set_clock
@@ -207,7 +207,7 @@ class EwsBox:
             except ReplyTimeoutError:
                 continue
 
-    async def meet(self, talk: Talk) -> Turns:
+    async def meet(self, talk: Talk) -> None:
         """Find out who answers, and what is installed, one exchange a turn.
 
         Two ports may do so at the same time: what one has learnt the other skips.
@@ -219,10 +219,9 @@ class EwsBox:
             else:
                 await self.read_status(talk)
                 self._known = True
-            yield 0.0
+            await rest(0.0)
         if self.installation is None:
-            async for pause in self.read_parameters(talk):
-                yield pause
+            await self.read_parameters(talk)
 
     async def _find_reading(self, talk: Talk) -> None:
         """Let it answer ``id``, under one reading of the checksum or the other."""
@@ -276,13 +275,13 @@ class EwsBox:
                 )
             )
 
-    async def read_parameters(self, talk: Talk) -> Turns:
+    async def read_parameters(self, talk: Talk) -> None:
         """Read what is installed; a box that does not tell is taken as it comes."""
         self.parameters_due = talk.now + PARAMETERS_RETRY
         system: SystemParameters | None = None
         try:
             system = await self.read(talk, SYSTEM_BLOCK.read, SYSTEM_BLOCK.decode)
-            yield 0.0
+            await rest(0.0)
             extra = await self.read(talk, EXTRA_BLOCK.read, EXTRA_BLOCK.decode)
         except ExchangeError:
             if system is not None:

@@ -10,9 +10,9 @@ from typing import Final, override
 
 from ..errors import GarbledReplyError, NotConfirmedError, SupersededError
 from ..exchange import Request, Talk
-from ..jobs import Later, Step
+from ..jobs import Later
 from ..model import ChargerConfig, Fault, Orders, Range, Setting
-from ..turns import Turns, in_turns
+from ..turns import rest
 from .dialects import MAPS
 from .exchanges import write
 from .reader import SmartEvseReader
@@ -36,7 +36,6 @@ class SmartEvseBox(SmartEvseReader):
         self.must_close = False
         """A setting may have opened the access that was off: to be closed again."""
         self._garbled = 0
-        self._conversations: set[object] = set()
         self._set_up = SetUp(self)
 
     @override
@@ -58,15 +57,11 @@ class SmartEvseBox(SmartEvseReader):
         except GarbledReplyError:
             self._garbled += 1
             if self._garbled >= GARBLED:
-                self.tell(Fault.DUPLICATE_ADDRESS, present=True)
+                self.notice(Fault.DUPLICATE_ADDRESS, present=True)
             raise
         self._garbled = 0
-        self.tell(Fault.DUPLICATE_ADDRESS, present=self.shares_address)
+        self.notice(Fault.DUPLICATE_ADDRESS, present=self.shares_address)
         return later or self.what_now(talk.now)
-
-    def turns(self, conversation: Callable[[Talk], Turns]) -> Step[None]:
-        """Return the first turn of a conversation with this box."""
-        return in_turns(conversation)
 
     def what_now(self, now: float) -> Later[None] | None:
         """Return what must be asked or said because of a status."""
@@ -74,27 +69,21 @@ class SmartEvseBox(SmartEvseReader):
             return None
         return Later(0.0, self.turns(self._tend))
 
-    async def _tend(self, talk: Talk) -> Turns:
-        token = self.begin()
-        try:
-            async for pause in self.tend(talk):
-                yield pause
-        finally:
-            self.end(token)
+    async def _tend(self, talk: Talk) -> None:
+        with self.conversing():
+            await self.tend(talk)
 
     def must_tend(self, now: float) -> bool:
         """Return whether something is to be asked or said beside the status."""
         return now >= self.configuration_due or self.must_close
 
-    async def tend(self, talk: Talk) -> Turns:
+    async def tend(self, talk: Talk) -> None:
         """Ask and say what is due; what is not answered is for another time."""
         if self.must_close:
-            async for pause in self.close_again(talk):
-                yield pause
-            yield 0.0
+            await self.close_again(talk)
+            await rest(0.0)
         if talk.now >= self.configuration_due:
-            async for pause in self.read_configuration(talk):
-                yield pause
+            await self.read_configuration(talk)
 
     # -- What it keeps in its memory -------------------------------------------------
 
@@ -124,7 +113,7 @@ class SmartEvseBox(SmartEvseReader):
         talk: Talk,
         allowed: bool,  # noqa: FBT001
         still: Callable[[], bool] = lambda: True,
-    ) -> Turns:
+    ) -> None:
         """Set the access bit until the box is read back to have obeyed.
 
         Off counts when no car can charge any more (`states.is_stopped`). ``still`` is
@@ -132,8 +121,7 @@ class SmartEvseBox(SmartEvseReader):
         Raises SupersededError where it says no, NotConfirmedError when the box does
         not follow.
         """
-        async for pause in self.reach(talk):
-            yield pause
+        await self.reach(talk)
         dialect = self.known_dialect
 
         def request() -> bytes:
@@ -148,24 +136,21 @@ class SmartEvseBox(SmartEvseReader):
                 # The user's word, or a limit that gives back: open it may be.
                 self.must_close = False
             for pause in (0.0, LOOK_AGAIN):
-                yield pause
-                async for wait in self.see(talk):
-                    yield wait
+                await rest(pause)
+                await self.see(talk)
                 if self._has_access(allowed):
                     return
-            yield 0.0
+            await rest(0.0)
         what = "on" if allowed else "off"
         message = f"{self.config.name} does not turn its access {what}"
         raise NotConfirmedError(message)
 
-    async def close_again(self, talk: Talk) -> Turns:
+    async def close_again(self, talk: Talk) -> None:
         """Turn access off where a setting has opened it, until it is certain."""
-        async for pause in self.see(talk):
-            yield pause
+        await self.see(talk)
         if self.status is None or self.status.access:
-            yield 0.0
-            async for pause in self.set_access(talk, allowed=False):
-                yield pause
+            await rest(0.0)
+            await self.set_access(talk, allowed=False)
         self.must_close = False
 
     def _has_access(self, allowed: bool) -> bool:  # noqa: FBT001
@@ -180,18 +165,3 @@ class SmartEvseBox(SmartEvseReader):
         return await write(talk, self.config.address, request, register)
 
     # -- Conversations -----------------------------------------------------------------
-
-    @property
-    def busy(self) -> bool:
-        """Return whether a conversation is under way: then polls only read."""
-        return bool(self._conversations)
-
-    def begin(self) -> object:
-        """Note that a conversation began."""
-        token = object()
-        self._conversations.add(token)
-        return token
-
-    def end(self, token: object) -> None:
-        """Note that a conversation is over."""
-        self._conversations.discard(token)

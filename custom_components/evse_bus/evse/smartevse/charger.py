@@ -9,7 +9,6 @@ PROTOCOLS.md, 3.
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Final, override
 
 from ..errors import (
@@ -18,7 +17,6 @@ from ..errors import (
     SupersededError,
 )
 from ..exchange import Talk
-from ..jobs import Later
 from ..model import (
     MINIMUM_CURRENT,
     ChargerConfig,
@@ -30,7 +28,7 @@ from ..model import (
     Persistence,
 )
 from ..safety import Setpoint, clamp
-from ..turns import Turns
+from ..turns import rest
 from .box import WRITES
 from .config import PolledConfig
 from .dialects import MAPS, Dialect
@@ -100,7 +98,7 @@ class PolledSmartEvse(PolledBox):
             self._defied = None
         settled = self._defied is None and not self._must_stop()
         if settled and (within or not charging):
-            self.tell(Fault.LIMIT_NOT_TAKEN, present=False)
+            self.notice(Fault.LIMIT_NOT_TAKEN, present=False)
 
     def _is_above(self, status: Status, setpoint: Setpoint | None = None) -> bool:
         """Return whether more is offered than may be; ahead of a car it is not."""
@@ -120,32 +118,26 @@ class PolledSmartEvse(PolledBox):
         )
 
     @override
-    async def tend(self, talk: Talk) -> Turns:
-        async for pause in self._stop_if_need_be(talk):
-            yield pause
+    async def tend(self, talk: Talk) -> None:
+        await self._stop_if_need_be(talk)
         if talk.now >= self.configuration_due:
             # Once in a while the override is written anew: a short failure of its
             # power may have passed unseen.
             self._written = None
-        async for pause in super().tend(talk):
-            yield pause
+        await super().tend(talk)
         # What it may offer is known only now.
-        async for pause in self._stop_if_need_be(talk):
-            yield pause
+        await self._stop_if_need_be(talk)
         if self._must_write():
-            async for pause in self._follow(talk, lambda: self.setpoint):
-                yield pause
+            await self._follow(talk, lambda: self.setpoint)
         if self._may_start(_NOTHING_NEW):
             # What took its current away was no order: installation, settings, time.
-            async for pause in self._allow(talk, _NOTHING_NEW):
-                yield pause
+            await self._allow(talk, _NOTHING_NEW)
 
-    async def _stop_if_need_be(self, talk: Talk) -> Turns:
+    async def _stop_if_need_be(self, talk: Talk) -> None:
         if self._must_stop():
             ours = self.effective_orders.allowed is not False
-            async for pause in self._stop(talk, ours=ours):
-                yield pause
-            yield 0.0
+            await self._stop(talk, ours=ours)
+            await rest(0.0)
 
     def _must_stop(self) -> bool:
         """Return whether a car may charge that must not."""
@@ -153,19 +145,18 @@ class PolledSmartEvse(PolledBox):
             return False
         return not is_stopped(self.known_dialect, self.status)
 
-    async def _stop(self, talk: Talk, *, ours: bool) -> Turns:
+    async def _stop(self, talk: Talk, *, ours: bool) -> None:
         """Turn access off; what our own limit takes away it may give back."""
         had_access = self.status is None or self.status.access
         try:
-            async for pause in self.set_access(talk, allowed=False):
-                yield pause
+            await self.set_access(talk, allowed=False)
         except NotConfirmedError:
-            self.tell(Fault.LIMIT_NOT_TAKEN, present=True)
+            self.notice(Fault.LIMIT_NOT_TAKEN, present=True)
             raise
         self._limit_paused = ours and (had_access or self._limit_paused)
         if not ours:
             self._defied = None
-            self.tell(Fault.LIMIT_NOT_TAKEN, present=False)
+            self.notice(Fault.LIMIT_NOT_TAKEN, present=False)
 
     def _must_write(self) -> bool:
         status = self.status
@@ -196,7 +187,7 @@ class PolledSmartEvse(PolledBox):
 
     # -- The current -----------------------------------------------------------------
 
-    async def _follow(self, talk: Talk, wanted: Callable[[], Setpoint]) -> Turns:
+    async def _follow(self, talk: Talk, wanted: Callable[[], Setpoint]) -> None:
         """Write the override; while a car charges, until it is read back.
 
         A box that goes on offering more is stopped: a limit is a promise. Raises
@@ -204,8 +195,7 @@ class PolledSmartEvse(PolledBox):
         """
         told = None
         for _ in range(WRITES):
-            async for pause in self.reach(talk):
-                yield pause
+            await self.reach(talk)
             status = self.status
             if status is None:
                 continue
@@ -216,9 +206,8 @@ class PolledSmartEvse(PolledBox):
             if status.raw_state not in CHARGING:
                 return
             if self.known_dialect is not Dialect.LATER:
-                yield LOOK_AGAIN
-            async for pause in self._settle(talk, wanted):
-                yield pause
+                await rest(LOOK_AGAIN)
+            await self._settle(talk, wanted)
             status = self.status
             setpoint = wanted()
             if (
@@ -228,11 +217,10 @@ class PolledSmartEvse(PolledBox):
                 or not self._is_above(status, setpoint)
             ):
                 return
-            yield 0.0
-        async for pause in self._give_up(talk, judged=told == tenths(wanted())):
-            yield pause
+            await rest(0.0)
+        await self._give_up(talk, judged=told == tenths(wanted()))
 
-    async def _give_up(self, talk: Talk, *, judged: bool) -> Turns:
+    async def _give_up(self, talk: Talk, *, judged: bool) -> None:
         """Stop a box that does not follow; ``judged``: it had its time.
 
         Raises NotConfirmedError, or SupersededError where a newer order came.
@@ -245,10 +233,9 @@ class PolledSmartEvse(PolledBox):
             message = "a newer limit came first"
             raise SupersededError(message)
         offers = offered(self.known_dialect, status)
-        async for pause in self._stop(talk, ours=True):
-            yield pause
+        await self._stop(talk, ours=True)
         self._defied = offers
-        self.tell(Fault.LIMIT_NOT_TAKEN, present=True)
+        self.notice(Fault.LIMIT_NOT_TAKEN, present=True)
         message = (
             f"{self.config.name} offers {offers:g} A whatever it is told, and has been "
             "stopped: set MAX in its menu to what may flow, or make it a slave of Home "
@@ -275,22 +262,20 @@ class PolledSmartEvse(PolledBox):
         self._written = None if answer is None else sent[-1]
         return sent[-1]
 
-    async def _settle(self, talk: Talk, wanted: Callable[[], Setpoint]) -> Turns:
+    async def _settle(self, talk: Talk, wanted: Callable[[], Setpoint]) -> None:
         """Look until the box offers what was written, or had the time to."""
         if self.known_dialect is Dialect.LATER:
             # Looking sooner would keep it from following; a poll may look for us.
             written_at = talk.now
             while self._looked_at < written_at:
                 while (pause := self.minimum_pause(talk.now)) > 0:
-                    yield pause
+                    await rest(pause)
                 if self._looked_at < written_at:
-                    async for pause in self.see(talk):
-                        yield pause
+                    await self.see(talk)
             return
         until = talk.now + SETTLING
         while True:
-            async for pause in self.see(talk):
-                yield pause
+            await self.see(talk)
             status = self.status
             if (
                 talk.now >= until
@@ -299,45 +284,31 @@ class PolledSmartEvse(PolledBox):
                 or offered(self.known_dialect, status) == wanted().current
             ):
                 return
-            yield LOOK_AGAIN
+            await rest(LOOK_AGAIN)
 
     # -- Orders ----------------------------------------------------------------------
 
     @override
-    async def impose(
-        self, talk: Talk, orders: Orders, change: OrderChange
-    ) -> Later[None] | None:
-        return await self.turns(partial(self._impose, orders, change))(talk)
-
-    async def _impose(self, orders: Orders, change: OrderChange, talk: Talk) -> Turns:
-        token = self.begin()
-        try:
-            async for pause in self._prepare(talk, change):
-                yield pause
+    async def impose(self, talk: Talk, orders: Orders, change: OrderChange) -> None:
+        with self.conversing():
+            await self._prepare(talk, change)
             if self._wanted(change).paused:
                 if self._must_pause(change):
                     ours = orders.allowed is not False
-                    async for pause in self._stop(talk, ours=ours):
-                        yield pause
+                    await self._stop(talk, ours=ours)
                 return
-            async for pause in self._allow(talk, change):
-                yield pause
-        finally:
-            self.end(token)
+            await self._allow(talk, change)
 
-    async def _prepare(self, talk: Talk, change: OrderChange) -> Turns:
+    async def _prepare(self, talk: Talk, change: OrderChange) -> None:
         """See how the box is now; the user's pause goes out sooner."""
-        async for pause in self.reach(talk):
-            yield pause
+        await self.reach(talk)
         if change.allowed is False:
             return
-        async for pause in self.see(talk):
-            yield pause
-        yield 0.0
+        await self.see(talk)
+        await rest(0.0)
         if self.configuration is None:
             # Without its own limits it would get 6 A first.
-            async for pause in self.read_configuration(talk):
-                yield pause
+            await self.read_configuration(talk)
 
     def _must_pause(self, change: OrderChange) -> bool:
         """Return whether a pause has to be said: the user's always, at once."""
@@ -348,15 +319,14 @@ class PolledSmartEvse(PolledBox):
     def _wanted(self, change: OrderChange) -> Setpoint:
         return clamp(self.sought(change), self.limits)
 
-    async def _allow(self, talk: Talk, change: OrderChange) -> Turns:
+    async def _allow(self, talk: Talk, change: OrderChange) -> None:
         """Let the box follow orders that let a car charge."""
 
         def wanted() -> Setpoint:
             return self._wanted(change)
 
-        async for pause in self._follow(talk, wanted):
-            yield pause
-        yield 0.0
+        await self._follow(talk, wanted)
+        await rest(0.0)
         if not self._may_start(change):
             return
 
@@ -364,8 +334,7 @@ class PolledSmartEvse(PolledBox):
             # Not where a pause came meanwhile: that one is on its way.
             return not (wanted().paused or self.leaves)
 
-        async for pause in self.set_access(talk, allowed=True, still=still):
-            yield pause
+        await self.set_access(talk, allowed=True, still=still)
         self._limit_paused = False
         self._defied = None
 

@@ -24,7 +24,6 @@ from ..model import (
     Setting,
 )
 from ..safety import Setpoint, clamp
-from ..turns import Turns
 from .balancing import RequestKind
 from .box import SmartEvseBox
 from .dialects import Block, Dialect
@@ -213,14 +212,13 @@ class Member(SmartEvseBox):
         return await super().write(talk, checked, register)
 
     @override
-    async def _find_dialect(self, talk: Talk) -> Turns:
-        async for pause in super()._find_dialect(talk):
-            yield pause
+    async def _find_dialect(self, talk: Talk) -> None:
+        await super()._find_dialect(talk)
         self.is_foreign = self.dialect is not Dialect.V2_17
         if self.is_foreign:
             self._look_again_at = talk.now + LOOK_FOR_OTHERS
             self.set_unavailable()
-            self.tell(Fault.UNSUPPORTED_FIRMWARE, present=True)
+            self.notice(Fault.UNSUPPORTED_FIRMWARE, present=True)
             raise self._refusal()
 
     def _refusal(self) -> NotAvailableError:
@@ -251,13 +249,13 @@ class Member(SmartEvseBox):
         # Without a share it is to be stopped, whatever it offers.
         if not closed or LOWEST <= share >= round(status.current * 10):
             self._over = 0
-            self.tell(Fault.LIMIT_NOT_TAKEN, present=False)
+            self.notice(Fault.LIMIT_NOT_TAKEN, present=False)
             return
         self._over += 1
         self.statistics.reasserted += 1
         self.master.hurry()
         if self._over > 1:
-            self.tell(Fault.LIMIT_NOT_TAKEN, present=True)
+            self.notice(Fault.LIMIT_NOT_TAKEN, present=True)
 
     @override
     def missed(self, now: float) -> None:

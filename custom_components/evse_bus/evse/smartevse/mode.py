@@ -1,13 +1,12 @@
 """Setting the mode of a SmartEVSE, until its next restart."""
 
-from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING
 
 from ..errors import NotAvailableError, NotConfirmedError, RefusedOrderError
 from ..exchange import Talk
 from ..model import Mode
-from ..turns import Turns
+from ..turns import Conversation, rest
 from .dialects import MAPS
 from .registers import write_mode
 
@@ -15,7 +14,7 @@ if TYPE_CHECKING:
     from .box import SmartEvseBox
 
 
-def mode_conversation(box: SmartEvseBox, value: object) -> Callable[[Talk], Turns]:
+def mode_conversation(box: SmartEvseBox, value: object) -> Conversation:
     """Return what sets the mode; RefusedOrderError for what is no mode."""
     try:
         mode = Mode(str(value))
@@ -25,25 +24,19 @@ def mode_conversation(box: SmartEvseBox, value: object) -> Callable[[Talk], Turn
     return partial(_set_mode, box, mode)
 
 
-async def _set_mode(box: SmartEvseBox, mode: Mode, talk: Talk) -> Turns:
-    token = box.begin()
-    try:
-        async for pause in box.reach(talk):
-            yield pause
-        async for pause in box.see(talk):
-            yield pause
+async def _set_mode(box: SmartEvseBox, mode: Mode, talk: Talk) -> None:
+    with box.conversing():
+        await box.reach(talk)
+        await box.see(talk)
         if _mode_of(box) is mode:
             return
         _check_changeable(box)
-        yield 0.0
+        await rest(0.0)
         dialect = box.known_dialect
         request = partial(write_mode, box.config.address, dialect, mode)
         await box.write(talk, request, MAPS[dialect].mode_register)
-        yield 0.0
-        async for pause in box.see(talk):
-            yield pause
-    finally:
-        box.end(token)
+        await rest(0.0)
+        await box.see(talk)
     if _mode_of(box) is not mode:
         message = f"{box.config.name} did not take the mode {mode}"
         raise NotConfirmedError(message)

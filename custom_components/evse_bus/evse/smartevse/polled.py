@@ -6,7 +6,7 @@ NO_COMM. So all that is to be said goes in one burst, and then there is quiet. O
 pause does not wait for its end. PROTOCOLS.md, 3.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import ClassVar, Final, override
@@ -16,7 +16,7 @@ from ..exchange import Request, Talk
 from ..jobs import Later, Step
 from ..model import ChargerConfig, Fault, Orders, Persistence, Range, Setting
 from ..schedule import Kind
-from ..turns import Turns, in_turns
+from ..turns import Conversation, in_turns
 from .box import SmartEvseBox
 from .config import polled_config
 from .dialects import Dialect
@@ -63,9 +63,9 @@ class PolledBox(SmartEvseBox):
     # -- When ------------------------------------------------------------------------
 
     @override
-    def turns(self, conversation: Callable[[Talk], Turns]) -> Step[None]:
+    def turns(self, conversation: Conversation) -> Step[None]:
         # Nobody else has a deadline here, and one burst costs a later box one quiet.
-        return in_turns(partial(_in_one_go, conversation))
+        return in_turns(conversation, in_one_go=True)
 
     @property
     @override
@@ -118,7 +118,7 @@ class PolledBox(SmartEvseBox):
         2.17 without load balancing has the address at which all others listen.
         """
         if self.shares_address:
-            self.tell(Fault.DUPLICATE_ADDRESS, present=True)
+            self.notice(Fault.DUPLICATE_ADDRESS, present=True)
             message = (
                 f"{self.config.name} has address 0, at which every SmartEVSE listens: "
                 "nothing is written while others are on its bus"
@@ -138,10 +138,3 @@ class PolledBox(SmartEvseBox):
             persistence=Persistence.STANDING,
             kind=Kind.PAUSE,
         )
-
-
-async def _in_one_go(conversation: Callable[[Talk], Turns], talk: Talk) -> Turns:
-    """Leave the pauses out that are only there to let others speak."""
-    async for pause in conversation(talk):
-        if pause > 0:
-            yield pause

@@ -25,7 +25,7 @@ from ..model import (
     Orders,
     Setting,
 )
-from ..turns import Turns
+from ..turns import rest
 from .config import smartevse_config
 from .dialects import MAPS, PROBE_A0, Block, Dialect
 from .exchanges import read
@@ -127,34 +127,32 @@ class SmartEvseReader(Charger):
 
     # -- Who it is -----------------------------------------------------------------
 
-    async def reach(self, talk: Talk) -> Turns:
+    async def reach(self, talk: Talk) -> None:
         """Make sure that we know whom we talk to, and what state it is in.
 
         Raises ImplausibleReplyError for a box of no known dialect, WrongChargerError
         for another box, and what `read` raises.
         """
         if self.dialect is None:
-            async for pause in self._find_dialect(talk):
-                yield pause
-            yield 0.0
+            await self._find_dialect(talk)
+            await rest(0.0)
         if self.status is None:
-            async for pause in self.see(talk):
-                yield pause
-            yield 0.0
+            await self.see(talk)
+            await rest(0.0)
 
-    async def _find_dialect(self, talk: Talk) -> Turns:
+    async def _find_dialect(self, talk: Talk) -> None:
         found = smartevse_config(self.config).dialect
         probe = Probe()
         while found is None:
             try:
                 await self._ask(talk, probe)
             except ImplausibleReplyError:
-                self.tell(Fault.UNSUPPORTED_FIRMWARE, present=True)
+                self.notice(Fault.UNSUPPORTED_FIRMWARE, present=True)
                 raise
             found = probe.found
             if found is None:
-                yield 0.0
-        self.tell(Fault.UNSUPPORTED_FIRMWARE, present=False)
+                await rest(0.0)
+        self.notice(Fault.UNSUPPORTED_FIRMWARE, present=False)
         self._half_known = 0
         self.dialect = found
         self.info = charger_info(found, self._serial)
@@ -168,7 +166,7 @@ class SmartEvseReader(Charger):
             # It answered a moment ago: to silence here there is more than noise.
             self._half_known += probe.ask != PROBE_A0
             if self._half_known >= NOT_UNDERSTOOD:
-                self.tell(Fault.UNSUPPORTED_FIRMWARE, present=True)
+                self.notice(Fault.UNSUPPORTED_FIRMWARE, present=True)
             raise
         else:
             probe.told(data)
@@ -187,7 +185,7 @@ class SmartEvseReader(Charger):
         """Return the bytes of a block (see `exchanges.read`)."""
         return await read(talk, self.config.address, block)
 
-    async def see(self, talk: Talk) -> Turns:
+    async def see(self, talk: Talk) -> None:
         """Look at the box; a lost answer is asked for again."""
         for last in (False,) * (LOOKS - 1) + (True,):
             try:
@@ -197,7 +195,7 @@ class SmartEvseReader(Charger):
                     raise
             else:
                 return
-            yield LOOK_AGAIN
+            await rest(LOOK_AGAIN)
 
     async def look(self, talk: Talk) -> Status:
         """Read the status, and keep it: one exchange.
@@ -219,7 +217,7 @@ class SmartEvseReader(Charger):
                 self._lose_faith()
             raise
         self._not_understood = 0
-        self.tell(Fault.IMPLAUSIBLE, present=False)
+        self.notice(Fault.IMPLAUSIBLE, present=False)
         self._check_identity(status)
         self.take(status, talk.now)
         return status
@@ -227,7 +225,7 @@ class SmartEvseReader(Charger):
     def _lose_faith(self) -> None:
         """Let nothing said before count: this box does not speak as it did."""
         self._not_understood = 0
-        self.tell(Fault.IMPLAUSIBLE, present=True)
+        self.notice(Fault.IMPLAUSIBLE, present=True)
         self.set_unavailable()
 
     def _check_identity(self, status: Status) -> None:
@@ -236,12 +234,12 @@ class SmartEvseReader(Charger):
             return
         expected = self.config.serial or self._serial
         if expected is not None and status.serial != expected:
-            self.tell(Fault.WRONG_CHARGER, present=True)
+            self.notice(Fault.WRONG_CHARGER, present=True)
             self.set_unavailable()
             found = status.serial or "no serial number"
             message = f"{self.config.name}: {found} answers, not {expected}"
             raise WrongChargerError(message, expected=expected, found=found)
-        self.tell(Fault.WRONG_CHARGER, present=False)
+        self.notice(Fault.WRONG_CHARGER, present=False)
         self._serial = status.serial
         self.info = charger_info(self.dialect, status.serial)
 
@@ -267,14 +265,14 @@ class SmartEvseReader(Charger):
 
     # -- What it keeps in its memory -------------------------------------------------
 
-    async def read_configuration(self, talk: Talk) -> Turns:
+    async def read_configuration(self, talk: Talk) -> None:
         """Read the settings; what is not told or cannot be changes nothing."""
         dialect = self.known_dialect
         told: dict[Block, bytes] = {}
         try:
             for block in MAPS[dialect].configuration:
                 told[block] = await self.read(talk, block)
-                yield 0.0
+                await rest(0.0)
             configuration = decode_configuration(dialect, told)
         except ImplausibleReplyError, ReplyTimeoutError, ExchangeRefusedError:
             # Before they are known the limit is 6 A: then each poll tries again.
@@ -285,9 +283,3 @@ class SmartEvseReader(Charger):
         self.configuration_due = talk.now + CONFIGURATION_INTERVAL
         if self.status is not None:
             self.take(self.status, talk.now)
-
-    def tell(self, fault: Fault, *, present: bool) -> None:
-        """Note a fault of our own finding, and tell the listeners of a change."""
-        if present != (fault in self.noticed):
-            self.notice(fault, present=present)
-            self.updated()

@@ -4,7 +4,6 @@ Such a write may open access that was off (PROTOCOLS.md, 3): it is closed again 
 same conversation, before anything else.
 """
 
-from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -16,7 +15,7 @@ from ..errors import (
 )
 from ..exchange import Talk
 from ..model import Setting
-from ..turns import Turns
+from ..turns import Conversation, rest
 from .dialects import MAPS
 from .registers import write_setting
 
@@ -31,7 +30,7 @@ class SetUp:
         """Take the box, for its state and its access."""
         self._box = box
 
-    def conversation(self, setting: Setting, value: int) -> Callable[[Talk], Turns]:
+    def conversation(self, setting: Setting, value: int) -> Conversation:
         """Return what sets something.
 
         Raises NotAvailableError where the box has no such setting, RefusedOrderError
@@ -50,46 +49,35 @@ class SetUp:
             raise RefusedOrderError(message)
         return partial(self._set, setting, value)
 
-    async def _set(self, setting: Setting, value: int, talk: Talk) -> Turns:
+    async def _set(self, setting: Setting, value: int, talk: Talk) -> None:
         box = self._box
-        token = box.begin()
-        try:
-            async for pause in self._look(talk):
-                yield pause
+        with box.conversing():
+            await self._look(talk)
             if self._is_set(setting, value):
                 # What is set already is not written: the memory wears out.
                 return
             # Remembered until it is certain: answers may be lost, or the line.
             box.must_close |= box.status is not None and not box.status.access
-            async for pause in self._write(setting, value, talk):
-                yield pause
+            await self._write(setting, value, talk)
             if box.must_close:
-                async for pause in self._close(talk):
-                    yield pause
-            async for pause in self._read_back(talk):
-                yield pause
-        finally:
-            box.end(token)
+                await self._close(talk)
+            await self._read_back(talk)
         if not self._is_set(setting, value):
             message = f"{box.config.name} did not take {setting} = {value}"
             raise NotConfirmedError(message)
 
-    async def _look(self, talk: Talk) -> Turns:
+    async def _look(self, talk: Talk) -> None:
         """Read access and settings as they are now."""
         box = self._box
-        async for pause in box.reach(talk):
-            yield pause
-        async for pause in box.see(talk):
-            yield pause
-        yield 0.0
-        async for pause in box.read_configuration(talk):
-            yield pause
+        await box.reach(talk)
+        await box.see(talk)
+        await rest(0.0)
+        await box.read_configuration(talk)
 
-    async def _read_back(self, talk: Talk) -> Turns:
+    async def _read_back(self, talk: Talk) -> None:
         box = self._box
         box.configuration = None
-        async for pause in box.read_configuration(talk):
-            yield pause
+        await box.read_configuration(talk)
         if box.configuration is None:
             # Nobody knows what it may offer now: to be read as soon as it can be.
             box.configuration_due = 0.0
@@ -98,7 +86,7 @@ class SetUp:
         configuration = self._box.configuration
         return configuration is not None and configuration.settings[setting] == value
 
-    async def _write(self, setting: Setting, value: int, talk: Talk) -> Turns:
+    async def _write(self, setting: Setting, value: int, talk: Talk) -> None:
         box = self._box
         dialect = box.known_dialect
         # Once, whatever the answer: the read-back tells whether it worked.
@@ -107,15 +95,14 @@ class SetUp:
             partial(write_setting, box.config.address, dialect, setting, value),
             MAPS[dialect].settings[setting].register,
         )
-        yield 0.0
+        await rest(0.0)
 
-    async def _close(self, talk: Talk) -> Turns:
+    async def _close(self, talk: Talk) -> None:
         """Turn access off again where the write has opened it."""
         box = self._box
         try:
-            async for pause in box.close_again(talk):
-                yield pause
-            yield 0.0
+            await box.close_again(talk)
+            await rest(0.0)
         except EvseError as error:
             message = (
                 f"{box.config.name}: access was off before the setting was written, "

@@ -18,7 +18,7 @@ from ..jobs import Later
 from ..modbus import ModbusFrame
 from ..model import Fault, OrderChange, Orders, Persistence
 from ..schedule import Kind
-from ..turns import Turns, in_turns
+from ..turns import in_turns, rest
 from .answers import ANSWER_BYTES, ANSWER_WITHIN, Answer
 from .balancing import RequestKind, SlaveRequest, acknowledge, decode_request
 from .dialects import Dialect
@@ -43,13 +43,11 @@ class SlaveSmartEvse(Member):
         return super().must_tend(now) or self._access_due() is not None
 
     @override
-    async def tend(self, talk: Talk) -> Turns:
+    async def tend(self, talk: Talk) -> None:
         due = self._access_due()
         if due is not None:
-            async for pause in self._turn(talk, due):
-                yield pause
-        async for pause in super().tend(talk):
-            yield pause
+            await self._turn(talk, due)
+        await super().tend(talk)
 
     def _access_due(self) -> bool | None:
         """Return what its access must be set to; ``None``: it may stay as it is.
@@ -62,7 +60,7 @@ class SlaveSmartEvse(Member):
             return False if self._must_be_off() else None
         return True if self._is_ours and self.may_begin() else None
 
-    async def _turn(self, talk: Talk, allowed: bool) -> Turns:  # noqa: FBT001
+    async def _turn(self, talk: Talk, allowed: bool) -> None:  # noqa: FBT001
         """Set the access bit, and remember whether that was our own doing."""
         if not allowed:
             own = self._standing.allowed is not False
@@ -70,12 +68,11 @@ class SlaveSmartEvse(Member):
                 # Somebody at the box may have been first: that is not ours to undo.
                 with suppress(EvseError):
                     await self.look(talk)
-                yield 0.0
+                await rest(0.0)
             had_access = self.status is None or self.status.access
             self._is_ours = own and (had_access or self._is_ours)
         still = self._may_be_on if allowed else self._must_be_off
-        async for pause in self.set_access(talk, allowed, still):
-            yield pause
+        await self.set_access(talk, allowed, still)
         if allowed:
             self._is_ours = False
 
@@ -97,52 +94,41 @@ class SlaveSmartEvse(Member):
     # -- Orders --------------------------------------------------------------------
 
     @override
-    async def impose(
-        self, talk: Talk, orders: Orders, change: OrderChange
-    ) -> Later[None] | None:
-        return await in_turns(partial(self._impose, change))(talk)
-
-    async def _impose(self, change: OrderChange, talk: Talk) -> Turns:
-        token = self.begin()
+    async def impose(self, talk: Talk, orders: Orders, change: OrderChange) -> None:
         self._confirming = change
         try:
-            async for pause in self.reach(talk):
-                yield pause
-            if change.allowed is False:
-                # The user's word: nothing of it is ours to give back.
-                self._withheld_at = None
-            if self.wanted.paused:
-                async for pause in self._turn(talk, allowed=False):
-                    yield pause
-                return
-            starts = change.allowed is True or self._is_ours
-            if starts and not self.withheld:
-                async for pause in self._turn(talk, allowed=True):
-                    yield pause
-                yield 0.0
-            async for pause in self._follow(talk):
-                yield pause
+            with self.conversing():
+                await self.reach(talk)
+                if change.allowed is False:
+                    # The user's word: nothing of it is ours to give back.
+                    self._withheld_at = None
+                if self.wanted.paused:
+                    await self._turn(talk, allowed=False)
+                    return
+                starts = change.allowed is True or self._is_ours
+                if starts and not self.withheld:
+                    await self._turn(talk, allowed=True)
+                    await rest(0.0)
+                await self._follow(talk)
         finally:
             self._confirming = None
-            self.end(token)
             self._changed()
 
-    async def _follow(self, talk: Talk) -> Turns:
+    async def _follow(self, talk: Talk) -> None:
         """Broadcast its current until it is read back, at it or below it.
 
         More than its share is not waited for. Raises NotConfirmedError.
         """
         for _ in range(BROADCASTS):
             await self.master.speak(talk)
-            yield 0.0
-            async for pause in self.see(talk):
-                yield pause
+            await rest(0.0)
+            await self.see(talk)
             if self.status and round(self.status.current * 10) <= tenths(self.wanted):
-                self.tell(Fault.LIMIT_NOT_TAKEN, present=False)
+                self.notice(Fault.LIMIT_NOT_TAKEN, present=False)
                 return
             self.statistics.reasserted += 1
-            yield LOOK_AGAIN
-        self.tell(Fault.LIMIT_NOT_TAKEN, present=True)
+            await rest(LOOK_AGAIN)
+        self.notice(Fault.LIMIT_NOT_TAKEN, present=True)
         message = f"{self.config.name} does not follow its limit"
         raise NotConfirmedError(message)
 
