@@ -45,7 +45,7 @@ async def add_entry(
         ConfigSubentryData,
     )
 
-    from custom_components.evse_bus.setup import charger_unique_id  # noqa: PLC0415
+    from custom_components.evse_bus.configuration import charger_unique_id  # noqa: PLC0415
 
     entry = ConfigEntry(
         data={"protocol": protocol, **where},

@@ -14,9 +14,9 @@ from pytest_homeassistant_custom_component.common import MockConfigEntry
 from custom_components.evse_bus.config_flow import EvseBusConfigFlow
 from custom_components.evse_bus.const import DOMAIN
 from custom_components.evse_bus.evse.protocols import PROTOCOLS
-from custom_components.evse_bus.flow_listener import ListenerOptionsFlow
-from custom_components.evse_bus.flow_schema import MAKES
-from custom_components.evse_bus.subentry_flow import ChargerSubentryFlow
+from custom_components.evse_bus.flows.listener import ListenerOptionsFlow
+from custom_components.evse_bus.flows.schema import MAKES
+from custom_components.evse_bus.flows.subentry import ChargerSubentryFlow
 from tests.flow import IMPOSED, NOWHERE, charger, english, port_step
 from tests.virtual import (
     EvboxChargePoint,

@@ -29,8 +29,8 @@ from custom_components.evse_bus.evse.ews.timing import (
     COMMAND_TIMEOUT,
 )
 from custom_components.evse_bus.evse.protocols import PROTOCOLS
-from custom_components.evse_bus.flow_listener import FIRST_PORT
-from custom_components.evse_bus.flow_schema import default_of
+from custom_components.evse_bus.flows.listener import FIRST_PORT
+from custom_components.evse_bus.flows.schema import default_of
 from custom_components.evse_bus.services import ACTIONS
 from tests.virtual import AblBox, Car, EwsBox, EwsDialler, VirtualBus
 

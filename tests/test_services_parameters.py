@@ -9,7 +9,7 @@ from homeassistant.core import HomeAssistant
 from homeassistant.exceptions import HomeAssistantError
 import pytest
 
-from custom_components.evse_bus.actions_parameters import BLOCKS, READABLE
+from custom_components.evse_bus.actions.parameters import BLOCKS, READABLE
 from custom_components.evse_bus.diagnostics import async_get_config_entry_diagnostics
 from tests.virtual import Car
 from tests.virtual.ews_box import EwsBox

@@ -13,8 +13,8 @@ from hypothesis import given, strategies as st
 import pytest
 from pytest_homeassistant_custom_component.common import MockConfigEntry
 
-from custom_components.evse_bus import actions_cards, actions_fields, actions_leds
-from custom_components.evse_bus.actions_parameters import (
+from custom_components.evse_bus.actions import cards, fields, leds
+from custom_components.evse_bus.actions.parameters import (
     BLOCKS,
     LOCK_TYPES,
     READABLE,
@@ -103,8 +103,8 @@ def test_choices_are_those_that_are_taken_and_have_texts() -> None:
     found = [one for name in ACTIONS for one in selects(fields_of(name))]
     found += selects(entry["fields"])
     options = {
-        "led": [*actions_leds.STATES],
-        "card_kind": [*actions_cards.KINDS],
+        "led": [*leds.STATES],
+        "card_kind": [*cards.KINDS],
         "parameter_block": [*READABLE],
         "lock_type": [*LOCK_TYPES],
         "box_time_zone": [*TIME_ZONES],
@@ -129,10 +129,10 @@ def number_fields(name: str) -> list[tuple[str, dict[str, Any]]]:
 
 def test_the_form_has_the_bounds_of_what_is_taken(subtests: pytest.Subtests) -> None:
     take: dict[str, Callable[[dict[str, object]], object]] = {
-        "set_leds": lambda data: actions_leds.port_leds(
+        "set_leds": lambda data: leds.port_leds(
             {next(iter(data)).split("_")[0]: "blink", **data}
         ),
-        "set_meter_total": lambda data: actions_fields.meter_total("", data["total"]),
+        "set_meter_total": lambda data: fields.meter_total("", data["total"]),
         **{WRITERS[block]: BLOCKS[block].changes for block in BLOCKS},
     }
     for name, action in take.items():
@@ -222,10 +222,10 @@ def test_what_passes_here_passes_the_library(data: st.DataObject) -> None:
         raise AssertionError(message) from error
 
 
-@given(st.dictionaries(st.sampled_from(actions_leds.FIELDS), ANYTHING))
+@given(st.dictionaries(st.sampled_from(leds.FIELDS), ANYTHING))
 def test_leds_that_pass_here_pass_the_library(given_: dict[str, object]) -> None:
     try:
-        leds = actions_leds.port_leds(given_)
+        shown = leds.port_leds(given_)
     except ServiceValidationError:
         return
-    assert set_leds(leds, PortLeds()).parameters
+    assert set_leds(shown, PortLeds()).parameters

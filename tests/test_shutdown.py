@@ -9,7 +9,7 @@ from homeassistant.const import EVENT_HOMEASSISTANT_STOP, Platform
 from homeassistant.core import HomeAssistant
 import pytest
 
-from custom_components.evse_bus import farewell as last_word
+from custom_components.evse_bus import unit
 from custom_components.evse_bus.evse.smartevse import PolledSmartEvse
 from tests.common import call, get_entity, running, state_of, wait_for_state
 from tests.smartevse import ACCESS, access_writes, car, shorten_quiet
@@ -26,7 +26,7 @@ async def stop(hass: HomeAssistant) -> None:
 
 @pytest.fixture
 def short_patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(last_word, "PATIENCE", 0.5)
+    monkeypatch.setattr(unit, "PATIENCE", 0.5)
 
 
 @pytest.mark.parametrize("dialect", ACCESS)

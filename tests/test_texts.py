@@ -10,7 +10,7 @@ from custom_components.evse_bus import (
     binary_sensor,
     button,
     event as events,
-    number_tables,
+    number,
     select as selects,
     sensor_counts,
     sensor_tables,
@@ -52,9 +52,9 @@ DESCRIPTIONS = {
     "button": button.BUTTONS,
     "event": events.EVENTS,
     "number": [
-        *number_tables.NUMBERS,
-        *number_tables.SETTINGS,
-        number_tables.SUPPLY,
+        *number.NUMBERS,
+        *number.SETTINGS,
+        number.SUPPLY,
     ],
     "select": [selects.MODE, selects.MODE_AT_START],
     "sensor": [

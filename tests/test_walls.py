@@ -119,7 +119,7 @@ def test_pure_parts_of_a_protocol_do_not_talk() -> None:
 
 def test_the_coordinator_does_not_know_the_entities() -> None:
     platforms = {"sensor", "number", "switch", "binary_sensor", "button", "entity"}
-    for name in ("coordinator", "orders", "setup", "const"):
+    for name in ("coordinator", "orders", "configuration", "const"):
         assert not local(INTEGRATION / f"{name}.py", INTEGRATION) & platforms
 
 

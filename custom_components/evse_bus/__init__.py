@@ -16,6 +16,8 @@ from homeassistant.helpers import config_validation as cv
 from homeassistant.helpers.device_registry import ChildDeviceEntry, DeviceEntry
 from homeassistant.helpers.typing import ConfigType
 
+from .configuration import made_of
+from .connections import ListenerLines
 from .const import DOMAIN
 from .coordinator import BusCoordinator, EvseBusConfigEntry
 from .discovery import (
@@ -25,10 +27,8 @@ from .discovery import (
 )
 from .errors import not_ready
 from .evse.errors import LineError
-from .lines import ListenerLines
 from .orders import OrderStore
 from .services import async_register
-from .setup import made_of
 
 CONFIG_SCHEMA = cv.config_entry_only_config_schema(DOMAIN)
 

@@ -15,6 +15,7 @@ from homeassistant.const import CONF_DEVICE
 from homeassistant.core import callback
 from homeassistant.data_entry_flow import AbortFlow
 
+from .configuration import line_settings, protocol_of
 from .const import (
     CONF_COMMAND,
     CONF_FAIL_SAFE_CURRENT,
@@ -29,19 +30,10 @@ from .evse.errors import RefusedOrderError
 from .evse.found import ScanReport
 from .evse.protocol import Progress, Protocol
 from .evse.protocols import PROTOCOLS
-from .flow_address import ADDRESSES, Errors, typed_addresses
-from .flow_charger import CONF_EXPERT, short_name
-from .flow_listener import ListenerOptionsFlow, ListenerSteps
-from .flow_scan import (
-    Imposed,
-    async_search,
-    async_try_port,
-    imposed,
-    is_same_port,
-    nothing_imposed,
-    port_name,
-)
-from .flow_schema import (
+from .flows.address import ADDRESSES, Errors, typed_addresses
+from .flows.charger import CONF_EXPERT, short_name
+from .flows.listener import ListenerOptionsFlow, ListenerSteps
+from .flows.schema import (
     SUGGESTED_LIMIT,
     bus_data,
     check_impose,
@@ -50,9 +42,17 @@ from .flow_schema import (
     port_suggestions,
     protocol_form,
 )
-from .flow_supply import check_supply, supply_data, supply_form
-from .setup import line_settings, protocol_of
-from .subentry_flow import ChargerSubentryFlow
+from .flows.search import (
+    Imposed,
+    async_search,
+    async_try_port,
+    imposed,
+    is_same_port,
+    nothing_imposed,
+    port_name,
+)
+from .flows.subentry import ChargerSubentryFlow
+from .flows.supply import check_supply, supply_data, supply_form
 
 _INTERFACES: Final = {"ews": "RS-232"}
 """What the adapter has to be, where it is not RS-485."""

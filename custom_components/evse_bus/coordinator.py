@@ -17,19 +17,7 @@ from homeassistant.helpers.event import async_track_time_interval
 from homeassistant.helpers.update_coordinator import BaseDataUpdateCoordinatorProtocol
 from homeassistant.util import dt as dt_util
 
-from .const import CONF_SERIAL, LOGGER, SUBENTRY_CHARGER
-from .devices import BusDevices, connector_key
-from .discovery import async_set_up_now, async_wants_to_connect
-from .evse.bus import Bus
-from .evse.ews import EwsPort
-from .evse.listeners import tell
-from .evse.model import ChargerConfig, Orders, Supply
-from .farewell import async_say_farewell
-from .finish import async_finish
-from .issues import BusIssues
-from .lines import lines_of
-from .orders import OrderStore
-from .setup import (
+from .configuration import (
     changes_in_place,
     charger_configs,
     charger_unique_id,
@@ -38,8 +26,18 @@ from .setup import (
     protocol_of,
     supply_of,
 )
+from .connections import lines_of
+from .const import CONF_SERIAL, LOGGER, SUBENTRY_CHARGER
+from .devices import BusDevices, connector_key
+from .discovery import async_set_up_now, async_wants_to_connect
+from .evse.bus import Bus
+from .evse.ews import EwsPort
+from .evse.listeners import tell
+from .evse.model import ChargerConfig, Orders, Supply
+from .issues import BusIssues
+from .orders import OrderStore, async_run_uncancelled
 from .supply import SharedSupply
-from .unit import ChargerUnit
+from .unit import ChargerUnit, async_say_farewell
 
 type EvseBusConfigEntry = ConfigEntry[BusCoordinator]
 type Context = tuple[str, int | None]
@@ -141,7 +139,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         if self.supply is not None:
             # What is on disk must count, also where nobody waits for it any more.
             order = self.supply.async_order(value)
-            await async_finish(self.hass, order, "evse_bus shared supply")
+            await async_run_uncancelled(self.hass, order, "evse_bus shared supply")
             self.issues.supply_renewed()
 
     async def _async_share(self, supply: Supply) -> None:

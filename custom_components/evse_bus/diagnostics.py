@@ -11,12 +11,12 @@ from homeassistant.const import CONF_ADDRESS, CONF_DEVICE, CONF_HOST
 from homeassistant.core import HomeAssistant
 from homeassistant.helpers.device_registry import ChildDeviceEntry, DeviceEntry
 
+from .connections import ListenerLines
 from .const import CONF_SERIAL, DOMAIN
 from .coordinator import BusCoordinator, EvseBusConfigEntry
 from .evse.bus import Bus
 from .evse.smartevse import Master
 from .evse.statistics import Direction
-from .lines import ListenerLines
 from .redaction import on_wire, without_serial
 from .unit import ChargerUnit
 

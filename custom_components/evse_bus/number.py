@@ -4,32 +4,251 @@ Limits show orders, never a reading: a slider that followed what the charger jus
 offers would go down with it and not come up again.
 """
 
-from collections.abc import Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable
+from dataclasses import dataclass
 from functools import partial
-from typing import override
+from math import floor, isfinite
+from typing import Any, Final, override
 
-from homeassistant.components.number import NumberEntity
-from homeassistant.const import Platform
+from homeassistant.components.number import (
+    NumberDeviceClass,
+    NumberEntity,
+    NumberEntityDescription,
+    NumberMode,
+)
+from homeassistant.const import (
+    EntityCategory,
+    Platform,
+    UnitOfElectricCurrent,
+    UnitOfTime,
+)
 from homeassistant.core import HomeAssistant
 from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
 
 from .coordinator import BusCoordinator, EvseBusConfigEntry
 from .entity import BusEntity, ChargerEntity, SettingEntity, add_charger_entities
 from .errors import translated_errors
-from .number_tables import (
-    FAIL_SAFE_CURRENT,
-    NUMBERS,
-    SETTINGS,
-    SUPPLY,
-    OrderNumberDescription,
-    SettingNumberDescription,
-    falls_back,
-    whole,
+from .evse.charger import Charger
+from .evse.errors import RefusedOrderError
+from .evse.model import (
+    Capability,
+    CurrentLimit,
+    Limits,
+    OrderChange,
+    Orders,
+    Phases,
+    Setting,
 )
+from .evse.safety import number
 from .supply import STEP, SharedSupply
 from .unit import ChargerUnit
 
 PARALLEL_UPDATES = 0
+
+LONGEST_TIMEOUT: Final = 3600
+"""Longest fail-safe time-out offered, s; a longer one would hardly be safe."""
+SHORTEST_STEP: Final = 0.1
+"""Finest step of a slider, A; what a protocol cannot say is rounded down."""
+
+FAIL_SAFE_CURRENT: Final = "fail_safe_current"
+
+
+def ceiling(limits: Limits) -> float:
+    """Return the highest current that may be asked for, A.
+
+    A maximum that the charger has not told yet does not count here: until it has,
+    6 A reach the wire whatever the order says.
+    """
+    if limits.reported is None:
+        return limits.installation
+    return min(limits.installation, limits.reported)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OrderNumberDescription(NumberEntityDescription):
+    """One number of a charger's orders."""
+
+    exists: Callable[[Charger], bool] = lambda _charger: True
+    value: Callable[[Orders, Limits], float]
+    change: Callable[[float], OrderChange]
+    lowest: Callable[[Limits], float] = lambda _limits: 0.0
+    highest: Callable[[Limits], float] = ceiling
+    finest: Callable[[Limits], float] = lambda limits: max(limits.step, SHORTEST_STEP)
+
+
+_CURRENT: Final[dict[str, Any]] = {
+    "device_class": NumberDeviceClass.CURRENT,
+    "native_unit_of_measurement": UnitOfElectricCurrent.AMPERE,
+    "mode": NumberMode.SLIDER,
+}
+
+
+def _one_phase(index: int, value: float) -> Phases[float | None]:
+    one, two, three = (value if at == index else None for at in range(3))
+    return one, two, three
+
+
+def _limit_of(index: int, limit: CurrentLimit, limits: Limits) -> float:
+    """Return a phase's own limit; without one nothing but the ceiling limits it."""
+    own = limit.phases[index]
+    return ceiling(limits) if own is None else min(own, ceiling(limits))
+
+
+def _has(capability: Capability) -> Callable[[Charger], bool]:
+    return lambda charger: capability in charger.capabilities
+
+
+def falls_back(charger: Charger) -> bool:
+    """Return whether a fail-safe current counts: the box's or an order's lifetime's."""
+    return (
+        Capability.FAIL_SAFE_CURRENT in charger.capabilities
+        or charger.config.order_lifetime is not None
+    )
+
+
+def _falls_back_per_phase(charger: Charger) -> bool:
+    return {Capability.FAIL_SAFE_CURRENT, Capability.PHASE_LIMITS} <= (
+        charger.capabilities
+    )
+
+
+def _phase_limit(index: int) -> OrderNumberDescription:
+    return OrderNumberDescription(
+        key=f"limit_l{index + 1}",
+        translation_key="limit_phase",
+        translation_placeholders={"phase": f"L{index + 1}"},
+        exists=_has(Capability.PHASE_LIMITS),
+        value=lambda orders, limits: _limit_of(index, orders.limit, limits),
+        change=lambda value: OrderChange(phases=_one_phase(index, value)),
+        **_CURRENT,
+    )
+
+
+def _phase_fail_safe(index: int) -> OrderNumberDescription:
+    return OrderNumberDescription(
+        key=f"fail_safe_current_l{index + 1}",
+        translation_key="fail_safe_current_phase",
+        translation_placeholders={"phase": f"L{index + 1}"},
+        entity_category=EntityCategory.CONFIG,
+        entity_registry_enabled_default=False,
+        exists=_falls_back_per_phase,
+        value=lambda orders, limits: _limit_of(index, orders.fail_safe, limits),
+        change=lambda value: OrderChange(fail_safe_phases=_one_phase(index, value)),
+        **_CURRENT,
+    )
+
+
+NUMBERS: Final[tuple[OrderNumberDescription, ...]] = (
+    OrderNumberDescription(
+        key="charging_current",
+        translation_key="charging_current",
+        value=lambda orders, limits: min(orders.limit.current, ceiling(limits)),
+        change=lambda value: OrderChange(current=value),
+        # A box whose own minimum is above all that it may offer has no range; what is
+        # ordered is refused with the reason.
+        lowest=lambda limits: min(limits.minimum, ceiling(limits)),
+        **_CURRENT,
+    ),
+    *(_phase_limit(index) for index in range(3)),
+    OrderNumberDescription(
+        key=FAIL_SAFE_CURRENT,
+        translation_key="fail_safe_current",
+        entity_category=EntityCategory.CONFIG,
+        exists=falls_back,
+        value=lambda orders, limits: min(orders.fail_safe.current, ceiling(limits)),
+        change=lambda value: OrderChange(fail_safe_current=value),
+        **_CURRENT,
+    ),
+    *(_phase_fail_safe(index) for index in range(3)),
+    OrderNumberDescription(
+        key="fail_safe_timeout",
+        translation_key="fail_safe_timeout",
+        entity_category=EntityCategory.CONFIG,
+        device_class=NumberDeviceClass.DURATION,
+        native_unit_of_measurement=UnitOfTime.SECONDS,
+        mode=NumberMode.BOX,
+        exists=_has(Capability.FAIL_SAFE_TIMEOUT),
+        value=lambda orders, _limits: orders.fail_safe_timeout,
+        # int() would raise something else for NaN.
+        change=lambda value: OrderChange(
+            fail_safe_timeout=int(number(value, "fail-safe time-out"))
+        ),
+        lowest=lambda _limits: 1,
+        highest=lambda _limits: LONGEST_TIMEOUT,
+        finest=lambda _limits: 1,
+    ),
+)
+
+
+# -- What a box keeps in its own memory ------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class SettingNumberDescription(NumberEntityDescription):
+    """A number that a box keeps in its own memory."""
+
+    setting: Setting
+
+
+def _setting(setting: Setting, **traits: Any) -> SettingNumberDescription:  # noqa: ANN401 - of many types
+    """Return the description of a setting.
+
+    Disabled at first: the memory of a box bears a limited number of writes, and
+    what is set once is best not at hand for automations.
+    """
+    key = f"setting_{setting}"
+    return SettingNumberDescription(
+        key=key,
+        translation_key=key,
+        entity_category=EntityCategory.CONFIG,
+        entity_registry_enabled_default=False,
+        mode=NumberMode.BOX,
+        native_step=1,
+        setting=setting,
+        **traits,
+    )
+
+
+_AMPERES: Final[dict[str, Any]] = {
+    "device_class": NumberDeviceClass.CURRENT,
+    "native_unit_of_measurement": UnitOfElectricCurrent.AMPERE,
+}
+
+SETTINGS: Final[tuple[SettingNumberDescription, ...]] = (
+    _setting(Setting.MINIMUM_CURRENT, **_AMPERES),
+    _setting(Setting.MAXIMUM_CURRENT, **_AMPERES),
+    _setting(Setting.CIRCUIT_CURRENT, **_AMPERES),
+    _setting(Setting.MAINS_CURRENT, **_AMPERES),
+    _setting(Setting.SOLAR_START_CURRENT, **_AMPERES),
+    _setting(Setting.SOLAR_IMPORT_CURRENT, **_AMPERES),
+    _setting(
+        Setting.SOLAR_STOP_TIME,
+        device_class=NumberDeviceClass.DURATION,
+        native_unit_of_measurement=UnitOfTime.MINUTES,
+    ),
+)
+
+
+def whole(value: float) -> int:
+    """Return a setting as a box stores it: rounded down.
+
+    Raises RefusedOrderError for what is not finite: NaN passes Home Assistant's own
+    range check.
+    """
+    if not isfinite(value):
+        message = f"not a finite number: {value!r}"
+        raise RefusedOrderError(message)
+    return floor(value)
+
+
+# -- What a bus shares -----------------------------------------------------------
+
+SUPPLY: Final = NumberEntityDescription(
+    key="shared_supply", translation_key="shared_supply", native_min_value=0, **_CURRENT
+)
+
+
+# -- Entities --------------------------------------------------------------------
 
 
 async def async_setup_entry(

@@ -7,7 +7,7 @@ charger has confirmed it, since losing one only means a lower limit.
 """
 
 import asyncio
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Coroutine, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, override
 
@@ -21,7 +21,6 @@ from .const import DOMAIN, LOGGER
 from .evse.errors import RefusedOrderError
 from .evse.model import CurrentLimit, Orders, Phases
 from .evse.safety import cautious, number
-from .finish import async_finish
 
 STORAGE_VERSION: Final = 1
 RAISE_DELAY: Final = 1.0
@@ -38,6 +37,27 @@ _UNREADABLE = (
     TypeError,
     ValueError,
 )
+
+
+async def async_run_uncancelled[T](
+    hass: HomeAssistant, coroutine: Coroutine[Any, Any, T], name: str
+) -> T:
+    """Run a coroutine to its end, even when the caller is cancelled.
+
+    Returns its result; raises what it raises. An automation that restarts cancels
+    the action it waits for: that ends the wait, not the action. (`asyncio.shield`
+    would log a failure that has no caller left.)
+    """
+    task = hass.async_create_task(coroutine, name)
+    task.add_done_callback(_retrieve_exception)
+    await asyncio.wait({task})
+    return task.result()
+
+
+def _retrieve_exception(task: asyncio.Task[Any]) -> None:
+    """Mark a failure as seen: asyncio warns of exceptions never retrieved."""
+    if not task.cancelled():
+        task.exception()
 
 
 class OrderStore:
@@ -127,7 +147,7 @@ class OrderStore:
     async def async_flush(self) -> None:
         """Write now what has not been written."""
         self._pending = False
-        await async_finish(self._hass, self._async_save(), "evse_bus orders")
+        await async_run_uncancelled(self._hass, self._async_save(), "evse_bus orders")
 
     async def _async_save(self) -> None:
         async with self._writing:

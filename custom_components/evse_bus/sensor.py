@@ -18,6 +18,7 @@ from homeassistant.core import HomeAssistant
 from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
 from homeassistant.util import dt as dt_util
 
+from .connections import ListenerLines
 from .coordinator import (
     BUS,
     STATISTICS,
@@ -35,7 +36,6 @@ from .entity import (
     supported,
 )
 from .evse.model import Capability, Fault
-from .lines import ListenerLines
 from .sensor_counts import (
     BUS_SENSORS,
     CHARGER_STATISTICS,

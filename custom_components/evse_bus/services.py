@@ -1,7 +1,7 @@
 """The actions: what a P-CHARGE EWS-Box can do that no entity stands for.
 
-Each takes a device: a box, or one of its ports. What else it takes is checked in the
-modules `actions_...`, so that whoever is wrong is told so in words.
+Each takes a device: a box, or one of its ports. The other fields are checked in
+`actions/`, with an error that names the field.
 """
 
 from collections.abc import Awaitable, Callable, Mapping
@@ -24,8 +24,8 @@ from homeassistant.helpers.service import (
 )
 import probatio as vol
 
-from . import actions_cards as cards, actions_leds as leds, actions_parameters as blocks
-from .actions_fields import meter_total
+from .actions import cards, leds, parameters as blocks
+from .actions.fields import meter_total
 from .const import DOMAIN
 from .errors import ActionError, failed_action, translated_errors, wrong_action
 from .evse.errors import NotConfirmedError

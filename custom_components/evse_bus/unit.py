@@ -1,13 +1,22 @@
 """One charger as the integration sees it: a box, or one port of a box."""
 
+import asyncio
+from collections.abc import Sequence
+from typing import Final
+
 from homeassistant.config_entries import ConfigSubentry
 from homeassistant.core import CALLBACK_TYPE
 
+from .configuration import port_count
+from .const import LOGGER
 from .evse.bus import Bus
 from .evse.charger import Charger
+from .evse.errors import EvseError
 from .evse.ews.events import Events
 from .evse.readings import ConnectorReading
-from .setup import port_count
+
+PATIENCE: Final = 5.0
+"""Longest time that Home Assistant is kept from stopping, s."""
 
 
 class ChargerUnit:
@@ -66,3 +75,32 @@ class ChargerUnit:
         if reading is None or not self.charger.available:
             return None
         return reading.connectors.get(number)
+
+
+async def async_say_farewell(
+    chargers: Sequence[Charger], *, for_good: bool = False
+) -> None:
+    """Let each charger be told what its set-up asks for; raises nothing.
+
+    ``for_good``: these chargers are removed, and Home Assistant goes on.
+
+    Orders stay as they are: what a charger is told now is not what the user wants
+    to stand.
+    """
+    results = await asyncio.gather(
+        *(_async_tell(charger, for_good) for charger in chargers),
+        return_exceptions=True,
+    )
+    for charger, result in zip(chargers, results, strict=True):
+        if result is not None:
+            LOGGER.error(
+                "%s was not told that %s: %s",
+                charger.config.name,
+                "it is removed" if for_good else "Home Assistant stops",
+                result if isinstance(result, EvseError) else repr(result),
+            )
+
+
+async def _async_tell(charger: Charger, for_good: bool) -> None:  # noqa: FBT001
+    async with asyncio.timeout(PATIENCE):
+        await charger.farewell(for_good=for_good)

@@ -3,10 +3,9 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
 
-from .actions_fields import Check, option, tag, text, whole
-from .errors import ActionError, wrong_action
-from .evse.errors import RefusedOrderError
-from .evse.ews.cards import (
+from ..errors import ActionError, wrong_action
+from ..evse.errors import RefusedOrderError
+from ..evse.ews.cards import (
     ENTRIES,
     LARGEST,
     AcceptedCard,
@@ -14,11 +13,12 @@ from .evse.ews.cards import (
     EntryKind,
     card_entry,
 )
+from .fields import Check, option, tag, text, whole
 
 if TYPE_CHECKING:
     from homeassistant.util.json import JsonObjectType
 
-    from .evse.ews import EwsPort
+    from ..evse.ews import EwsPort
 
 CONF_GROUP: Final = "group"
 CONF_NUMBER: Final = "number"

@@ -34,29 +34,29 @@ from homeassistant.helpers.selector import (
 )
 import probatio as vol
 
-from .const import (
+from ..connections import address_name
+from ..const import (
     CONF_ALLOWED,
     CONF_PROTOCOL,
     CONF_SERIAL,
     LOGGER,
     SUBENTRY_CHARGER,
 )
-from .discovery import CONF_ENTRY, CONF_FIRMWARE, CONF_PEER, box_unique_id, is_set_up
-from .evse.errors import (
+from ..discovery import CONF_ENTRY, CONF_FIRMWARE, CONF_PEER, box_unique_id, is_set_up
+from ..evse.errors import (
     EvseError,
     LineError,
     PortBusyError,
     PortMissingError,
     PortPermissionError,
 )
-from .evse.ews import Listener
-from .evse.found import FoundCharger
-from .evse.protocols import PROTOCOLS
-from .evse.readings import ChargerInfo
-from .flow_address import Errors
-from .flow_charger import Candidate, short_name
-from .flow_steps import ChargerSteps
-from .lines import address_name
+from ..evse.ews import Listener
+from ..evse.found import FoundCharger
+from ..evse.protocols import PROTOCOLS
+from ..evse.readings import ChargerInfo
+from .address import Errors
+from .charger import Candidate, short_name
+from .steps import ChargerSteps
 
 if TYPE_CHECKING:
     from homeassistant.core import HomeAssistant

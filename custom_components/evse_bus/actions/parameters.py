@@ -10,20 +10,8 @@ from dataclasses import dataclass
 from enum import IntFlag
 from typing import TYPE_CHECKING, Any, Final
 
-from .actions_fields import (
-    Check,
-    address,
-    limit,
-    netmask,
-    option,
-    pin,
-    secret,
-    switch,
-    text,
-    whole,
-)
-from .errors import ActionError, wrong_action
-from .evse.ews.parameters import (
+from ..errors import ActionError, wrong_action
+from ..evse.ews.parameters import (
     EXTRA_BLOCK,
     INSTALLATION_BLOCK,
     SOURCE_PORTS,
@@ -35,12 +23,24 @@ from .evse.ews.parameters import (
     SystemMode,
     TimeZone,
 )
+from .fields import (
+    Check,
+    address,
+    limit,
+    netmask,
+    option,
+    pin,
+    secret,
+    switch,
+    text,
+    whole,
+)
 
 if TYPE_CHECKING:
     from homeassistant.util.json import JsonObjectType, JsonValueType
 
-    from .evse.ews import EwsPort
-    from .evse.ews.box import Dhcp
+    from ..evse.ews import EwsPort
+    from ..evse.ews.box import Dhcp
 
 CONF_BLOCK: Final = "block"
 SECRETS: Final = "secrets"

@@ -7,25 +7,26 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from homeassistant.config_entries import ConfigSubentry, ConfigSubentryData
 from homeassistant.const import CONF_ADDRESS, CONF_NAME
-from homeassistant.data_entry_flow import FlowContext, FlowResult
+from homeassistant.data_entry_flow import FlowContext, FlowHandler, FlowResult
 
-from .const import (
+from ..configuration import charger_unique_id, line_settings
+from ..connections import line_name
+from ..const import (
     CONF_INSTALLATION_LIMIT,
     SUBENTRY_CHARGER,
 )
-from .discovery import box_unique_id, is_set_up
-from .evse.found import Address, ScanReport
-from .flow_address import ADDRESSES, Errors, manual_form, typed_addresses
-from .flow_charger import (
+from ..discovery import box_unique_id, is_set_up
+from ..evse.found import Address, ScanReport
+from .address import ADDRESSES, Errors, manual_form, typed_addresses
+from .charger import (
     Candidate,
     charger_data,
     charger_form,
     check_charger,
+    confirm_row,
     default_name,
 )
-from .flow_confirm import ConfirmSteps
-from .flow_scan import error_key
-from .flow_schema import (
+from .schema import (
     CONF_CHARGERS,
     SUGGESTED_LIMIT,
     check_currents,
@@ -33,19 +34,19 @@ from .flow_schema import (
     found_options,
     model_name,
 )
-from .lines import line_name
-from .setup import charger_unique_id, line_settings
+from .search import error_key
+from .supply import supply_texts
 
 if TYPE_CHECKING:
-    from .evse.found import FoundCharger
-    from .evse.protocol import Progress
+    from ..evse.found import FoundCharger
+    from ..evse.protocol import Progress, Protocol
 
 
 class ChargerSteps[
     ContextT: FlowContext,
     ResultT: FlowResult[Any, Any],
     HandlerT,
-](ConfirmSteps[ContextT, ResultT, HandlerT]):
+](FlowHandler[ContextT, ResultT, HandlerT]):
     """From a bus to chargers that are ready to be stored."""
 
     at_once: ClassVar[bool]
@@ -56,6 +57,10 @@ class ChargerSteps[
     def __init__(self) -> None:
         """Start with nothing found."""
         super().__init__()
+        self.protocol: Protocol
+        self.bus_data: dict[str, Any]
+        """Data of the bus's entry."""
+        self.ready: list[ConfigSubentryData] = []
         self.suggestions: dict[str, Any] = {}
         """Values typed so far that the next forms offer again."""
         self._scan_task: asyncio.Task[ScanReport] | None = None
@@ -68,6 +73,10 @@ class ChargerSteps[
     @abstractmethod
     async def async_scan(self, progress: Progress) -> ScanReport:
         """Search the bus; leave no port open that was not open before."""
+
+    @abstractmethod
+    def finish(self, chargers: list[ConfigSubentryData]) -> ResultT:
+        """Store the chargers."""
 
     def choices(self) -> tuple[str, ...]:
         """Return where one can go when a search brought nothing to add."""
@@ -363,3 +372,54 @@ class ChargerSteps[
                 )
             )
         return errors
+
+    # -- Confirm: each protocol explains its own fail-safe ------------------------
+
+    def confirm(self, user_input: dict[str, Any] | None = None) -> ResultT:
+        """Show what will be stored, or store it now that it is confirmed."""
+        # A page that is loaded again asks for the step without having confirmed.
+        if user_input is not None:
+            return self.finish(self.ready)
+        rows = (confirm_row(self.protocol, one) for one in self.ready)
+        return self.async_show_form(
+            step_id=f"confirm_{self.protocol.key}",
+            description_placeholders=supply_texts(self.bus_data)
+            | {"chargers": "\n".join(rows)},
+            last_step=True,
+        )
+
+    async def async_step_confirm_evbox(
+        self, user_input: dict[str, Any] | None = None
+    ) -> ResultT:
+        """Store, now that the user knows an EVBox's fail-safe."""
+        return self.confirm(user_input)
+
+    async def async_step_confirm_abl(
+        self, user_input: dict[str, Any] | None = None
+    ) -> ResultT:
+        """Store, now that the user knows that an ABL box has none."""
+        return self.confirm(user_input)
+
+    async def async_step_confirm_smartevse(
+        self, user_input: dict[str, Any] | None = None
+    ) -> ResultT:
+        """Store, now that the user knows that a polled SmartEVSE has none."""
+        return self.confirm(user_input)
+
+    async def async_step_confirm_smartevse_master(
+        self, user_input: dict[str, Any] | None = None
+    ) -> ResultT:
+        """Store, now that the user knows that slaves stop without us."""
+        return self.confirm(user_input)
+
+    async def async_step_confirm_ews(
+        self, user_input: dict[str, Any] | None = None
+    ) -> ResultT:
+        """Store, now that the user knows what an EWS-Box does without its server."""
+        return self.confirm(user_input)
+
+    async def async_step_confirm_ews_network(
+        self, user_input: dict[str, Any] | None = None
+    ) -> ResultT:
+        """Store, now that the user knows what it does when it cannot dial."""
+        return self.confirm(user_input)

@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 import probatio as vol
 
-from .const import CONF_SUPPLY_LIMIT, CONF_SUPPLY_MINIMUM
-from .evse.model import MAXIMUM_CURRENT, MINIMUM_CURRENT
-from .flow_schema import is_number, quantity, suggest
+from ..const import CONF_SUPPLY_LIMIT, CONF_SUPPLY_MINIMUM
+from ..evse.model import MAXIMUM_CURRENT, MINIMUM_CURRENT
+from .schema import is_number, quantity, suggest
 
 if TYPE_CHECKING:
-    from .evse.protocol import Protocol
-    from .flow_address import Errors
+    from ..evse.protocol import Protocol
+    from .address import Errors
 
 SUGGESTED_SUPPLY: Final = 16.0
 """The smallest usual circuit for chargers; taken only once it was confirmed, A."""

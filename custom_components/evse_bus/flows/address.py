@@ -14,10 +14,10 @@ from homeassistant.helpers.selector import (
 )
 import probatio as vol
 
-from .evse.found import Address
+from ..evse.found import Address
 
 if TYPE_CHECKING:
-    from .evse.protocol import Protocol
+    from ..evse.protocol import Protocol
 
 type Errors = dict[str, str]
 """What is wrong, by the key of a form's field."""

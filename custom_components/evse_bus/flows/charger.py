@@ -9,7 +9,8 @@ from homeassistant.data_entry_flow import section
 from homeassistant.helpers.selector import BooleanSelector, TextSelector
 import probatio as vol
 
-from .const import (
+from ..configuration import PORT_LIMITS
+from ..const import (
     CONF_COMMAND,
     CONF_FAIL_SAFE_CURRENT,
     CONF_FAIL_SAFE_TIMEOUT,
@@ -24,11 +25,11 @@ from .const import (
     CONF_STOP_ON_SHUTDOWN,
     CONF_VOLTAGE,
 )
-from .evse.found import Address
-from .evse.model import MINIMUM_CURRENT
-from .evse.safety import MAXIMUM_TIMEOUT
-from .flow_address import ADDRESSES, Errors
-from .flow_schema import (
+from ..evse.found import Address
+from ..evse.model import MINIMUM_CURRENT
+from ..evse.safety import MAXIMUM_TIMEOUT
+from .address import ADDRESSES, Errors
+from .schema import (
     COMMANDS,
     DEFAULT_FAIL_SAFE_TIMEOUT,
     amperes,
@@ -40,13 +41,12 @@ from .flow_schema import (
     model_name,
     quantity,
 )
-from .setup import PORT_LIMITS
 
 if TYPE_CHECKING:
     from homeassistant.config_entries import ConfigSubentry, ConfigSubentryData
 
-    from .evse.found import FoundCharger
-    from .evse.protocol import Protocol
+    from ..evse.found import FoundCharger
+    from ..evse.protocol import Protocol
 
 CONF_EXPERT: Final = "expert"
 

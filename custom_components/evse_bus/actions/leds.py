@@ -3,9 +3,8 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
 
-from .actions_fields import option, whole
-from .errors import ActionError, wrong_action
-from .evse.ews.commands import (
+from ..errors import ActionError, wrong_action
+from ..evse.ews.commands import (
     LED_OFF,
     LED_ON,
     LED_UNCHANGED,
@@ -13,9 +12,10 @@ from .evse.ews.commands import (
     PortLeds,
     blinking,
 )
+from .fields import option, whole
 
 if TYPE_CHECKING:
-    from .evse.ews import EwsPort
+    from ..evse.ews import EwsPort
 
 LEDS: Final = ("red", "green", "orange", "spare")
 UNCHANGED: Final = "unchanged"

@@ -22,7 +22,7 @@ from homeassistant.helpers.selector import (
 )
 import probatio as vol
 
-from .const import (
+from ..const import (
     CONF_BAUDRATE,
     CONF_COMMAND,
     CONF_FAIL_SAFE_CURRENT,
@@ -34,15 +34,15 @@ from .const import (
     CONF_PROTOCOL,
     CONF_STOP_BITS,
 )
-from .evse.errors import RefusedOrderError
-from .evse.model import MAXIMUM_CURRENT, MINIMUM_CURRENT
-from .evse.safety import INTERVALS_PER_TIMEOUT, MAXIMUM_TIMEOUT, number
-from .flow_address import ADDRESSES, Errors
+from ..evse.errors import RefusedOrderError
+from ..evse.model import MAXIMUM_CURRENT, MINIMUM_CURRENT
+from ..evse.safety import INTERVALS_PER_TIMEOUT, MAXIMUM_TIMEOUT, number
+from .address import ADDRESSES, Errors
 
 if TYPE_CHECKING:
-    from .evse.found import FoundCharger
-    from .evse.framing import LineSettings
-    from .evse.protocol import Protocol
+    from ..evse.found import FoundCharger
+    from ..evse.framing import LineSettings
+    from ..evse.protocol import Protocol
 
 # Keys of the forms that are stored under another name, or not at all.
 CONF_LINE: Final = "line"

@@ -13,9 +13,9 @@ from typing import Final
 from homeassistant.helpers import config_validation as cv
 import probatio as vol
 
-from .errors import ActionError, wrong_action
-from .evse.ews.cards import TAG_LENGTH
-from .evse.ews.commands import MINIMUM_LIMIT
+from ..errors import ActionError, wrong_action
+from ..evse.ews.cards import TAG_LENGTH
+from ..evse.ews.commands import MINIMUM_LIMIT
 
 type Check[V] = Callable[[str, object], V]
 """Takes the name of a field and what was given, returns what is meant."""

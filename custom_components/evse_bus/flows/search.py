@@ -6,14 +6,14 @@ from os.path import realpath
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import urlsplit
 
-from .const import (
+from ..const import (
     CONF_COMMAND,
     CONF_FAIL_SAFE_CURRENT,
     CONF_FAIL_SAFE_TIMEOUT,
     CONF_INSTALLATION_LIMIT,
     LOGGER,
 )
-from .evse.errors import (
+from ..evse.errors import (
     LineBusyError,
     LineError,
     LineLostError,
@@ -23,16 +23,16 @@ from .evse.errors import (
     PortPermissionError,
     PortSettingsError,
 )
-from .evse.found import Address, ScanReport
-from .evse.line import Line
-from .evse.model import ChargerConfig, CurrentLimit, Orders
-from .flow_address import ADDRESSES
-from .flow_schema import CONF_SEARCH_CURRENT
+from ..evse.found import Address, ScanReport
+from ..evse.line import Line
+from ..evse.model import ChargerConfig, CurrentLimit, Orders
+from .address import ADDRESSES
+from .schema import CONF_SEARCH_CURRENT
 
 if TYPE_CHECKING:
-    from .evse.bus import Bus
-    from .evse.framing import LineSettings
-    from .evse.protocol import Progress, Protocol
+    from ..evse.bus import Bus
+    from ..evse.framing import LineSettings
+    from ..evse.protocol import Progress, Protocol
 
 type Imposed = tuple[ChargerConfig, Orders]
 """What a search sets on a charger, where every message sets limits."""

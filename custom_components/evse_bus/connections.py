@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, override
 
 from homeassistant.const import CONF_DEVICE, CONF_HOST, CONF_PORT
 
+from .configuration import line_settings, protocol_of, supply_of
 from .const import CONF_ALLOWED
 from .evse.ews import Listener, Stranger
-from .setup import line_settings, protocol_of, supply_of
 
 if TYPE_CHECKING:
     from ipaddress import IPv4Network, IPv6Network

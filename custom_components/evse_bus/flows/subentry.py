@@ -13,31 +13,31 @@ from homeassistant.config_entries import (
 )
 from homeassistant.const import CONF_ADDRESS, CONF_NAME
 
-from .const import (
+from ..configuration import charger_unique_id, protocol_of
+from ..connections import Lines, ListenerLines
+from ..const import (
     CONF_FAIL_SAFE_CURRENT,
     CONF_FAIL_SAFE_TIMEOUT,
     CONF_INSTALLATION_LIMIT,
     CONF_SERIAL,
     SUBENTRY_CHARGER,
 )
-from .evse.errors import NotAvailableError
-from .evse.found import Address, ScanReport
-from .flow_address import ADDRESSES, Errors, typed_addresses
-from .flow_charger import (
+from ..evse.errors import NotAvailableError
+from ..evse.found import Address, ScanReport
+from .address import ADDRESSES, Errors, typed_addresses
+from .charger import (
     charger_data,
     charger_form,
     charger_suggestions,
     check_charger,
 )
-from .flow_listener import found_box
-from .flow_scan import async_search, nothing_imposed
-from .flow_steps import ChargerSteps
-from .lines import Lines, ListenerLines
-from .setup import charger_unique_id, protocol_of
+from .listener import found_box
+from .search import async_search, nothing_imposed
+from .steps import ChargerSteps
 
 if TYPE_CHECKING:
-    from .coordinator import EvseBusConfigEntry
-    from .evse.protocol import Progress
+    from ..coordinator import EvseBusConfigEntry
+    from ..evse.protocol import Progress
 
 
 class ChargerSubentryFlow(

@@ -1,0 +1,1 @@
+"""Actions of an EWS-Box: the meaning of their fields, one file for each subject."""

@@ -1,0 +1,1 @@
+"""Steps and forms of the dialogues that config_flow.py starts."""
