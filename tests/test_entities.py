@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from contextlib import AbstractAsyncContextManager
 from typing import Any
 
+from attrs import evolve, fields
 from homeassistant.const import Platform
 from homeassistant.core import HomeAssistant
 from homeassistant.helpers import device_registry as dr, entity_registry as er
@@ -14,6 +15,7 @@ from custom_components.evse_bus.const import DOMAIN
 from custom_components.evse_bus.evse.protocols import PROTOCOLS
 from custom_components.evse_bus.sensor_counts import BUS_SENSORS, CHARGER_STATISTICS
 from tests.common import call, get_entity, running, wait_for_state, wait_until
+from tests.entity_table import VARYING, device_table, entity_table
 from tests.ews import listening
 from tests.virtual import AblBox, EvboxChargePoint, EwsBox, SmartEvse
 from tests.virtual.device import Device
@@ -89,11 +91,7 @@ async def test_entities(
         registry = er.async_get(hass)
         entries = er.async_entries_for_config_entry(registry, entry.entry_id)
         assert {one.domain for one in entries} <= set(Platform)
-        for one in sorted(entries, key=lambda one: one.entity_id):
-            assert one == snapshot(name=f"{one.entity_id}-entry")
-            if not one.unique_id.endswith(UNSTEADY):
-                state = hass.states.get(one.entity_id)
-                assert state == snapshot(name=f"{one.entity_id}-state")
+        assert entity_table(hass, entries, UNSTEADY) == snapshot
 
 
 @pytest.mark.usefixtures("all_entities_enabled")
@@ -106,13 +104,47 @@ async def test_devices(
         registry = dr.async_get(hass)
         charger = next(iter(entry.subentries))
         find = registry.async_get_device_by_identifier
-        assert find((DOMAIN, "bus"), "bus") == snapshot(name="bus")
-        assert find((DOMAIN, charger), "bus") == snapshot(name="charger")
         child = registry.async_get_child_device_by_identifier
-        assert child((DOMAIN, f"{charger}_1"), "bus") == snapshot(name="connector")
-        if PROTOCOLS[protocol].ports > 1:
-            second = child((DOMAIN, f"{charger}_2"), "bus")
-            assert second == snapshot(name="second connector")
+        devices = [
+            find((DOMAIN, "bus"), "bus"),
+            find((DOMAIN, charger), "bus"),
+            child((DOMAIN, f"{charger}_1"), "bus"),
+            child((DOMAIN, f"{charger}_2"), "bus"),
+        ]
+        assert device_table(filter(None, devices)) == snapshot
+
+
+async def test_the_table_shows_every_change(hass: HomeAssistant) -> None:
+    """A field that the table leaves out would change without a snapshot failing."""
+    async with running(hass, AblBox(1)) as (entry, _):
+        limit = await get_entity(hass, "number", entry, "charging_current")
+        one = er.async_get(hass).async_get(limit)
+        assert one is not None
+        before = entity_table(hass, [one], UNSTEADY)
+        state = hass.states.get(limit)
+        assert state is not None
+        hidden = {
+            field.name
+            for field in fields(er.RegistryEntry)
+            if field.init and field.name not in {*VARYING, "entity_id"}
+            if entity_table(hass, [changed(one, field.name)], UNSTEADY) == before
+        }
+        for name in state.attributes:
+            attributes = {**state.attributes, name: "changed"}
+            hass.states.async_set(limit, state.state, attributes)
+            if entity_table(hass, [one], UNSTEADY) == before:
+                hidden.add(name)
+        hass.states.async_set(limit, "changed", state.attributes)
+        assert entity_table(hass, [one], UNSTEADY) != before
+    assert not hidden
+
+
+def changed(entry: er.RegistryEntry, name: str) -> er.RegistryEntry:
+    """Return a registry entry with another value of one field."""
+    value: object = "changed"
+    if name in ("capabilities", "options"):
+        value = {"sensor": {"changed": 1}}
+    return evolve(entry, **{name: value})
 
 
 async def test_only_what_a_charger_has(hass: HomeAssistant) -> None:
