@@ -67,7 +67,7 @@ def test_only_the_entries_that_are_named_are_changed(
     data: bytes, changes: dict[int, int]
 ) -> None:
     cards = decode_cards(data).with_entries(
-        {at: CardEntry(raw) for at, raw in changes.items()}
+        {at: CardEntry(raw=raw) for at, raw in changes.items()}
     )
     after = write_cards(cards).parameters
     for at in range(64):
@@ -143,14 +143,14 @@ def test_entries_that_cannot_be(kind: EntryKind, group: int, card: int) -> None:
 @pytest.mark.parametrize("at", [-1, 64])
 def test_an_entry_that_there_is_not(at: int) -> None:
     with pytest.raises(RefusedOrderError):
-        decode_cards(LIST).with_entries({at: CardEntry(0)})
+        decode_cards(LIST).with_entries({at: CardEntry(raw=0)})
 
 
 def test_a_list_that_is_not_whole_is_not_written() -> None:
     with pytest.raises(RefusedOrderError):
-        write_cards(CardList(63 * (CardEntry(0),)))
+        write_cards(CardList(entries=63 * (CardEntry(raw=0),)))
     with pytest.raises(RefusedOrderError):
-        write_cards(CardList(64 * (CardEntry(1 << 32),)))
+        write_cards(CardList(entries=64 * (CardEntry(raw=1 << 32),)))
 
 
 def test_ma() -> None:

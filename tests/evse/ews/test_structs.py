@@ -25,18 +25,20 @@ from custom_components.evse_bus.evse.ews import (
 from custom_components.evse_bus.evse.ews.fields import (
     Address,
     Ascii,
-    Bits,
     Centivolts,
-    Field,
-    Flag,
     Identity,
     Moment,
+)
+from custom_components.evse_bus.evse.fields import (
+    Field,
+    Flag,
+    Flags,
     Number,
     Raw,
     Text,
-    Untold,
+    Unused,
 )
-from custom_components.evse_bus.evse.ews.structs import Many, Optional, Part, Struct
+from custom_components.evse_bus.evse.structs import Many, Optional, Part, Struct
 
 LENGTHS: dict[int, list[Struct[Any]]] = {
     9: [info.INFO],
@@ -65,7 +67,7 @@ def _numbers(field: Number) -> st.SearchStrategy[int]:
 VALUES: dict[type[Field[Any]], Callable[[Any], st.SearchStrategy[Any]]] = {
     Number: _numbers,
     Flag: lambda _: st.booleans(),
-    Bits: lambda field: st.integers(0, 255).map(field.kind),
+    Flags: lambda field: st.integers(0, 255).map(field.kind),
     Centivolts: lambda _: (
         st.none() | st.integers(-1500, 1500).map(lambda value: value / 100)
     ),
@@ -81,9 +83,9 @@ VALUES: dict[type[Field[Any]], Callable[[Any], st.SearchStrategy[Any]]] = {
     Moment: lambda _: (
         st.none() | st.datetimes().map(lambda now: now.replace(microsecond=0))
     ),
-    Untold: lambda _: st.none(),
+    Unused: lambda _: st.none(),
     Part: lambda field: value_of_struct(field.struct),
-    Optional: lambda field: st.none() | value_of_struct(field.struct),
+    Optional: lambda field: st.none() | value_of(field.part),
     Many: lambda field: st.tuples(*field.count * [value_of(field.field)]),
 }
 
@@ -141,7 +143,7 @@ def test_a_change_changes_only_its_field(
     end = start + field.width
     assert after[:start] == before[:start]
     assert after[end:] == before[end:]
-    if isinstance(field, Bits):
+    if isinstance(field, Flags):
         known = sum(field.kind)
         assert after[start] == value & known | before[start] & ~known
     else:
@@ -183,16 +185,16 @@ CANNOT_BE_WRITTEN: list[tuple[Field[Any], list[object]]] = [
     ),
     (Number(name="x", width=2), [-1, 0x10000, 1.5, False]),
     (Flag(name="x"), [0, 1, None, "yes"]),
-    (Bits(name="x", kind=_Lights), [1, True, _OTHER, None]),
+    (Flags(name="x", kind=_Lights), [1, True, _OTHER, None]),
     (Centivolts(name="x"), [15.01, -15.01, float("nan"), float("inf"), "5"]),
     (Text(name="x", width=4), ["abcde", "äöüßx", "€", "a\0b", "a\nb", b"ab", 5, None]),
     (Ascii(name="x", width=4), ["123", "12345", "12 €", "ä234", 1234, "12\x003"]),
     (Raw(name="x", width=2), [b"", b"1", b"123", "12", None]),
     (Address(name="x"), ["192.168.0.1", 0, None]),
     (Moment(name="x"), [datetime(2020, 1, 1, tzinfo=UTC), "2020-01-01", 0]),
-    (Untold(name="x", width=2), [0, False, b"\0\0"]),
+    (Unused(name="x", width=2), [0, False, b"\0\0"]),
     (status.PORT.fields[-1], ["card", 0, cards.AcceptedCard(group=1, number=1)]),
-    (cards.CARD_LIST.fields[0], [(), [cards.CardEntry(0)] * 64, (0,) * 64]),
+    (cards.CARD_LIST.fields[0], [(), [cards.CardEntry(raw=0)] * 64, (0,) * 64]),
 ]
 
 
@@ -245,8 +247,8 @@ def test_what_cannot_be_read(field: Field[Any], wire: str) -> None:
         (Centivolts(name="x").decode, "05dd", None),
         (Centivolts(name="x").decode, "fa23", None),
         (Centivolts(name="x").decode, "8000", None),
-        (Bits(name="x", kind=parameters.CableMode).decode, "f8", 0xF8),
-        (Untold(name="x", width=2).decode, "ffff", None),
+        (Flags(name="x", kind=parameters.CableMode).decode, "f8", 0xF8),
+        (Unused(name="x", width=2).decode, "ffff", None),
     ],
 )
 def test_what_is_read(

@@ -4,15 +4,14 @@ Source of the tables: manual, 3.2.4. Cards and the box's network are private: no
 shows them.
 """
 
-from dataclasses import dataclass, field
 from datetime import datetime
 from enum import KEEP, IntFlag
 from ipaddress import IPv4Address
 from typing import Final
 
-from .fields import Address, Bits, Flag, Identity, Moment, Number, Raw, Text
-from .status import CARD_FIELDS
-from .structs import Struct, optional
+from ..fields import Flag, Flags, Number, Raw, Text
+from ..structs import Struct, coded, optional, record
+from .fields import Address, Identity, Moment
 
 _SUPPLY: Final = (0, *range(6, 81))
 """A: not told, or from the lowest limit (3.1.8) to what a control pilot can offer."""
@@ -31,85 +30,55 @@ class BoxFlags(IntFlag, boundary=KEEP):
     BACKUP_TIMEOUT = 1 << 4
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class PresentedCard:
     """A card at the reader."""
 
-    tag: bytes = field(repr=False)
+    tag: bytes = coded(Raw(width=7), secret=True)
     """Number of the tag, 7 bytes."""
-    valid: bool
+    valid: bool = coded(Flag())
     """The box's own list knows it. Means nothing over Ethernet: always yes there."""
-    decode_error: int
+    decode_error: int = coded(Number(width=1))
     """0: it could be read."""
-    group: int = field(repr=False)
-    number: int = field(repr=False)
+    group: int = coded(Number(width=2), secret=True)
+    number: int = coded(Number(width=2), secret=True)
     """Within its group."""
-    user: str = field(repr=False)
+    user: str = coded(Text(width=8), secret=True)
 
 
-PRESENTED_CARD: Final = Struct(
-    PresentedCard,
-    "3.2.4 rs: card",
-    (
-        Raw(name="tag", width=7),
-        Flag(name="valid"),
-        Number(name="decode_error", width=1),
-        *CARD_FIELDS,
-    ),
-)
+PRESENTED_CARD: Final = Struct(PresentedCard, "3.2.4 rs: card")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class BoxStatus:
     """What ``rs`` tells of the box."""
 
-    firmware: str
-    flags: BoxFlags
-    serial: str
-    website_size: int
+    firmware: str = coded(Text(width=11))
+    flags: BoxFlags = coded(Flags(kind=BoxFlags))
+    serial: str = coded(Identity(width=12))
+    website_size: int = coded(Number(width=4, unit="bytes"))
     """Bytes."""
-    website_crc: int
-    website_version: str
-    lan_error: int
+    website_crc: int = coded(Number(width=2))
+    website_version: str = coded(Text(width=20))
+    lan_error: int = coded(Number(width=1))
     """Of the LAN chip when it was started; 0: none."""
-    mac: bytes = field(repr=False)
-    server_connected: bool
-    web_client: IPv4Address = field(repr=False)
+    mac: bytes = coded(Raw(width=6), secret=True)
+    server_connected: bool = coded(Flag())
+    web_client: IPv4Address = coded(Address(), secret=True)
     """Who looks at the box's web page."""
-    maximum_current: int
+    maximum_current: int = coded(Number(width=1, unit="A", possible=_SUPPLY))
     """Highest charging current or fuse of the box, A; 0: not told (yet)."""
-    ventilating: bool
-    clock: datetime | None
+    ventilating: bool = coded(Flag())
+    clock: datetime | None = coded(Moment())
     """In the box's time zone; ``None``: not set."""
-    reader_error: int
+    reader_error: int = coded(Number(width=1))
     """Of the card reader when it was started; 0: found and right."""
-    reader_firmware: str
-    card: PresentedCard | None = field(repr=False)
+    reader_firmware: str = coded(Text(width=11))
+    card: PresentedCard | None = coded(optional(PRESENTED_CARD), secret=True)
     """At the reader now."""
 
 
-BOX: Final = Struct(
-    BoxStatus,
-    "3.2.4 rs",
-    (
-        Text(name="firmware", width=11),
-        Bits(name="flags", kind=BoxFlags),
-        Identity(name="serial", width=12),
-        Number(name="website_size", width=4, unit="bytes"),
-        Number(name="website_crc", width=2),
-        Text(name="website_version", width=20),
-        Number(name="lan_error", width=1),
-        Raw(name="mac", width=6),
-        Flag(name="server_connected"),
-        Address(name="web_client"),
-        Number(name="maximum_current", width=1, unit="A", possible=_SUPPLY),
-        Flag(name="ventilating"),
-        Moment(name="clock"),
-        Number(name="reader_error", width=1),
-        Text(name="reader_firmware", width=11),
-        optional("card", PRESENTED_CARD),
-    ),
-)
+BOX: Final = Struct(BoxStatus, "3.2.4 rs")
 
 
 def decode_box(data: bytes) -> BoxStatus:
@@ -120,35 +89,23 @@ def decode_box(data: bytes) -> BoxStatus:
 # -- rg: what DHCP gave ------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Dhcp:
     """What ``rg`` tells of a box with DHCP."""
 
-    address: IPv4Address = field(repr=False)
-    gateway: IPv4Address = field(repr=False)
-    netmask: IPv4Address = field(repr=False)
-    server: IPv4Address = field(repr=False)
+    address: IPv4Address = coded(Address(), secret=True)
+    gateway: IPv4Address = coded(Address(), secret=True)
+    netmask: IPv4Address = coded(Address(), secret=True)
+    server: IPv4Address = coded(Address(), secret=True)
     """Its "logical" address."""
-    server_real: IPv4Address = field(repr=False)
-    lease: int
+    server_real: IPv4Address = coded(Address(), secret=True)
+    lease: int = coded(Number(width=4, unit="s"))
     """s; 0: for ever."""
-    lease_left: int
+    lease_left: int = coded(Number(width=4, unit="s"))
     """s; the connection is dropped at half the lease."""
 
 
-DHCP: Final = Struct(
-    Dhcp,
-    "3.2.4 rg",
-    (
-        Address(name="address"),
-        Address(name="gateway"),
-        Address(name="netmask"),
-        Address(name="server"),
-        Address(name="server_real"),
-        Number(name="lease", width=4, unit="s"),
-        Number(name="lease_left", width=4, unit="s"),
-    ),
-)
+DHCP: Final = Struct(Dhcp, "3.2.4 rg")
 
 
 def decode_dhcp(data: bytes) -> Dhcp:

@@ -6,14 +6,14 @@ leaves out 3, a blocked card. The command reference is taken, and 3 from 3.1.6.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from enum import IntEnum
 from typing import Final
 
 from ..errors import RefusedOrderError
-from .fields import Number, Raw, Text
+from ..fields import Number, Raw, Text
+from ..structs import Struct, coded, many, part, record
 from .frames import CommandId, Request
-from .structs import Struct, many, part
 
 ENTRIES: Final = 64
 LARGEST: Final = 0x3FFF
@@ -35,11 +35,11 @@ class EntryKind(IntEnum):
     """This card may not, whatever its group may (3.1.6)."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class CardEntry:
     """One entry of the list, as the 32 bits that it is."""
 
-    raw: int = field(repr=False)
+    raw: int = coded(Number(width=4), secret=True)
 
     @property
     def kind_code(self) -> int:
@@ -62,6 +62,9 @@ class CardEntry:
         return self.raw & LARGEST
 
 
+_ENTRY: Final = Struct(CardEntry, "3.2.4 sf: entry")
+
+
 def card_entry(kind: EntryKind, group: int = 0, card: int = 0) -> CardEntry:
     """Return an entry for the list; RefusedOrderError for what does not fit.
 
@@ -75,14 +78,14 @@ def card_entry(kind: EntryKind, group: int = 0, card: int = 0) -> CardEntry:
     if card not in (range(1, LARGEST + 1) if single else range(1)):
         message = f"a card is 1 to {LARGEST}, and 0 where none is meant"
         raise RefusedOrderError(message)
-    return CardEntry(kind << _KIND_SHIFT | group << _GROUP_SHIFT | card)
+    return CardEntry(raw=kind << _KIND_SHIFT | group << _GROUP_SHIFT | card)
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class CardList:
     """The list, all of it: it is read and written at once."""
 
-    entries: tuple[CardEntry, ...] = field(repr=False)
+    entries: tuple[CardEntry, ...] = coded(many(part(_ENTRY), ENTRIES), secret=True)
 
     def with_entries(self, changes: Mapping[int, CardEntry]) -> CardList:
         """Return the list with some entries (0 to 63) replaced, and nothing else.
@@ -106,13 +109,10 @@ class CardList:
             if other != at and {at, other} & changes.keys():
                 message = f"entries {other} and {at} are about the same card or group"
                 raise RefusedOrderError(message)
-        return CardList(after)
+        return CardList(entries=after)
 
 
-_ENTRY: Final = Struct(CardEntry, "3.2.4 sf: entry", (Number(name="raw", width=4),))
-CARD_LIST: Final = Struct(
-    CardList, "3.2.4 sf", (many(part("entries", _ENTRY), ENTRIES),)
-)
+CARD_LIST: Final = Struct(CardList, "3.2.4 sf")
 
 
 def decode_cards(data: bytes) -> CardList:
@@ -128,26 +128,18 @@ def write_cards(cards: CardList) -> Request:
 # -- ma: accepting a card that the box itself does not know ------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class AcceptedCard:
     """Whom the server accepts for the next start."""
 
-    group: int = field(repr=False)
-    number: int = field(repr=False)
-    user: str = field(default="", repr=False)
+    group: int = coded(Number(width=2, valid=range(LARGEST + 1)), secret=True)
+    number: int = coded(Number(width=2, valid=range(LARGEST + 1)), secret=True)
+    user: str = coded(Text(width=8), default="", secret=True)
     tag: bytes | None = field(default=None, repr=False)
     """7 bytes, for the box's history."""
 
 
-ACCEPTED_CARD: Final = Struct(
-    AcceptedCard,
-    "3.2.4 ma",
-    (
-        Number(name="group", width=2, valid=range(LARGEST + 1)),
-        Number(name="number", width=2, valid=range(LARGEST + 1)),
-        Text(name="user", width=8),
-    ),
-)
+ACCEPTED_CARD: Final = Struct(AcceptedCard, "3.2.4 ma")
 _TAG: Final = Raw(name="tag", width=TAG_LENGTH)
 
 

@@ -4,18 +4,18 @@ Source: manual, 3.2.4. Values come from people and programs: what does not fit i
 refused, never cut or wrapped. Cards and parameters have modules of their own.
 """
 
-from dataclasses import dataclass
 from datetime import datetime
 from enum import IntEnum
 from typing import Final
 
 from ..errors import RefusedOrderError
+from ..fields import Number
 from ..safety import Setpoint
-from .fields import Moment, Number
+from ..structs import Struct, coded, pair, part, record
+from .fields import Moment
 from .frames import MAXIMUM_PARAMETERS, CommandId, Request
 from .states import StartStop, check_order, check_unlock
 from .status import PortStatus
-from .structs import Struct, many, part
 
 PORTS: Final = (1, 2)
 """Numbers of the ports; the manual calls them cars."""
@@ -147,18 +147,19 @@ def set_clock(clock: datetime) -> Request:
 _FOREVER: Final = 0xFFFF
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Led:
     """What one LED is to do."""
 
-    on: int
+    on: int = coded(Number(width=2, unit="ms"))
     """ms; 0: dark, 65535: lit, or as it was if ``off`` is 65535 too."""
-    off: int
+    off: int = coded(Number(width=2, unit="ms"))
     """ms"""
-    offset: int = 0
+    offset: int = coded(Number(width=2, unit="ms"), default=0)
     """Where in its rhythm it begins, ms."""
 
 
+_LED: Final = Struct(Led, "3.2.4 se: LED")
 LED_OFF: Final = Led(on=0, off=0)
 LED_ON: Final = Led(on=_FOREVER, off=0)
 LED_UNCHANGED: Final = Led(on=_FOREVER, off=_FOREVER)
@@ -175,43 +176,27 @@ def blinking(on: int, off: int, offset: int = 0) -> Led:
     return Led(on=on, off=off, offset=offset)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class PortLeds:
     """The four LEDs of a port."""
 
-    red: Led = LED_UNCHANGED
-    green: Led = LED_UNCHANGED
-    orange: Led = LED_UNCHANGED
-    spare: Led = LED_UNCHANGED
+    red: Led = coded(part(_LED), default=LED_UNCHANGED)
+    green: Led = coded(part(_LED), default=LED_UNCHANGED)
+    orange: Led = coded(part(_LED), default=LED_UNCHANGED)
+    spare: Led = coded(part(_LED), default=LED_UNCHANGED)
 
 
-@dataclass(frozen=True, slots=True)
+_PORT_LEDS: Final = Struct(PortLeds, "3.2.4 se: port")
+
+
+@record
 class Leds:
     """The LEDs of port 1 and port 2."""
 
-    ports: tuple[PortLeds, PortLeds]
+    ports: tuple[PortLeds, PortLeds] = coded(pair(part(_PORT_LEDS)))
 
 
-_LED: Final = Struct(
-    Led,
-    "3.2.4 se: LED",
-    (
-        Number(name="on", width=2, unit="ms"),
-        Number(name="off", width=2, unit="ms"),
-        Number(name="offset", width=2, unit="ms"),
-    ),
-)
-_PORT_LEDS: Final = Struct(
-    PortLeds,
-    "3.2.4 se: port",
-    (
-        part("red", _LED),
-        part("green", _LED),
-        part("orange", _LED),
-        part("spare", _LED),
-    ),
-)
-LEDS: Final = Struct(Leds, "3.2.4 se", (many(part("ports", _PORT_LEDS)),))
+LEDS: Final = Struct(Leds, "3.2.4 se")
 
 
 def set_leds(first: PortLeds, second: PortLeds) -> Request:
@@ -220,7 +205,7 @@ def set_leds(first: PortLeds, second: PortLeds) -> Request:
     Only a box whose keys and LEDs are set to manual takes it. Raises
     RefusedOrderError for times that do not fit.
     """
-    return Request(CommandId.SET_LEDS, LEDS.encode(Leds((first, second))))
+    return Request(CommandId.SET_LEDS, LEDS.encode(Leds(ports=(first, second))))
 
 
 # -- mc: the card reader -----------------------------------------------------------

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from enum import KEEP, IntFlag
 from typing import Final
 
-from .fields import Bits, Number
+from ..fields import Flags, Number
+from ..structs import Struct, coded, many, record
 from .frames import EwsFrame, MessageId
-from .structs import Struct, many
 
 _NAME: Final = "if"
 KEYS: Final = 4
@@ -42,12 +42,12 @@ class KeyEvent:
     """How long it was pressed, s; ``None``: it is pressed now."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Info:
     """What the record tells."""
 
-    changes: Change
-    keys: tuple[int, ...]
+    changes: Change = coded(Flags(kind=Change))
+    keys: tuple[int, ...] = coded(many(Number(width=1, unit="0.1 s"), 2 * KEYS))
     """Port 1, key 1 to 4, then port 2: 0 nothing, 255 pressed, else held for 0.1 s."""
 
     @property
@@ -64,14 +64,7 @@ class Info:
         )
 
 
-INFO: Final = Struct(
-    Info,
-    "3.2.3 if",
-    (
-        Bits(name="changes", kind=Change),
-        many(Number(name="keys", width=1, unit="0.1 s"), 2 * KEYS),
-    ),
-)
+INFO: Final = Struct(Info, "3.2.3 if")
 
 
 def decode_info(frame: EwsFrame) -> Info | None:

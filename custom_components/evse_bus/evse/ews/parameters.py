@@ -10,15 +10,16 @@ stand in it is not written, unless the secret is named too: it would be erased.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import KEEP, Enum, IntEnum, IntFlag
 from ipaddress import IPv4Address
 from typing import Final
 
 from ..errors import RefusedOrderError
-from .fields import Address, Ascii, Bits, Flag, Number, Raw, Text
+from ..fields import Flag, Flags, Number, Raw, Text
+from ..structs import Struct, coded, record
+from .fields import Address, Ascii
 from .frames import CommandId, Request
-from .structs import Struct
 
 _ANY_BYTE: Final = range(256)
 _LIMIT: Final = (0, *range(6, 81))
@@ -63,25 +64,25 @@ class LockType(IntEnum):
     """FCT: locked is low."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class SystemParameters:
     """What ``rp`` tells."""
 
-    admin_password: str = field(repr=False)
-    ports: int
-    mode: SystemMode
-    pulses_per_kwh: int
+    admin_password: str = coded(Text(width=12), secret=True)
+    ports: int = coded(Number(width=1, possible=range(1, 3)))
+    mode: SystemMode = coded(Flags(kind=SystemMode))
+    pulses_per_kwh: int = coded(Number(width=4, unit="1/kWh"))
     """Of the meter; of port 1's where port 2 has its own."""
-    lock_type: int
+    lock_type: int = coded(Number(width=1, valid=tuple(LockType)))
     """See `LockType`; of a plugged cable."""
-    card_pin: str = field(repr=False)
+    card_pin: str = coded(Ascii(width=4), secret=True)
     """Only cards with this are read."""
-    ventilation: bool
+    ventilation: bool = coded(Flag())
     """The installation can ventilate."""
-    maximum_current: int
+    maximum_current: int = coded(Number(width=1, unit="A", valid=_LIMIT))
     """A; 0: what the jumper says. With a fixed cable, the cable's too."""
-    restart_after_power_failure: bool
-    cable_mode: CableMode
+    restart_after_power_failure: bool = coded(Flag())
+    cable_mode: CableMode = coded(Flags(kind=CableMode))
 
     @property
     def mode_1(self) -> tuple[bool, bool]:
@@ -97,22 +98,7 @@ class SystemParameters:
         return CableMode.FIXED_CABLE in self.cable_mode
 
 
-SYSTEM: Final = Struct(
-    SystemParameters,
-    "3.2.4 sp",
-    (
-        Text(name="admin_password", width=12),
-        Number(name="ports", width=1, possible=range(1, 3)),
-        Bits(name="mode", kind=SystemMode),
-        Number(name="pulses_per_kwh", width=4, unit="1/kWh"),
-        Number(name="lock_type", width=1, valid=tuple(LockType)),
-        Ascii(name="card_pin", width=4),
-        Flag(name="ventilation"),
-        Number(name="maximum_current", width=1, unit="A", valid=_LIMIT),
-        Flag(name="restart_after_power_failure"),
-        Bits(name="cable_mode", kind=CableMode),
-    ),
-)
+SYSTEM: Final = Struct(SystemParameters, "3.2.4 sp")
 
 
 # -- ru, su: the network -----------------------------------------------------------
@@ -132,102 +118,66 @@ SOURCE_PORTS: Final = 10
 """The box dials from so many ports, one after the other."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class UserParameters:
     """What ``ru`` tells. Wrong ones cut the box off the network."""
 
-    user_password: str = field(repr=False)
-    address: IPv4Address = field(repr=False)
+    user_password: str = coded(Text(width=12), secret=True)
+    address: IPv4Address = coded(Address(), secret=True)
     """0.0.0.0: by DHCP, and gateway and netmask are ignored."""
-    source_port: int
+    source_port: int = coded(Number(width=2, valid=range(0x10001 - SOURCE_PORTS)))
     """First of `SOURCE_PORTS` from which it dials the server."""
-    gateway: IPv4Address = field(repr=False)
-    netmask: IPv4Address = field(repr=False)
-    server: IPv4Address = field(repr=False)
-    server_port: int
-    language: int
-    zone_code: int
+    gateway: IPv4Address = coded(Address(), secret=True)
+    netmask: IPv4Address = coded(Address(), secret=True)
+    server: IPv4Address = coded(Address(), secret=True)
+    server_port: int = coded(Number(width=2))
+    language: int = coded(Number(width=1, valid=_ANY_BYTE))
+    zone_code: int = coded(Number(width=1, valid=tuple(TimeZone)))
     """See `TimeZone`."""
 
 
-USER: Final = Struct(
-    UserParameters,
-    "3.2.4 su",
-    (
-        Text(name="user_password", width=12),
-        Address(name="address"),
-        Number(name="source_port", width=2, valid=range(0x10001 - SOURCE_PORTS)),
-        Address(name="gateway"),
-        Address(name="netmask"),
-        Address(name="server"),
-        Number(name="server_port", width=2),
-        Number(name="language", width=1, valid=_ANY_BYTE),
-        Number(name="zone_code", width=1, valid=tuple(TimeZone)),
-    ),
-)
+USER: Final = Struct(UserParameters, "3.2.4 su")
 
 
 # -- ri, si: whose it is -----------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class InstallationInfo:
     """What ``ri`` tells: texts about the owner."""
 
-    name: str = field(repr=False)
-    street: str = field(repr=False)
-    town: str = field(repr=False)
-    telephone: str = field(repr=False)
-    customer_number: str = field(repr=False)
+    name: str = coded(Text(width=30), secret=True)
+    street: str = coded(Text(width=30), secret=True)
+    town: str = coded(Text(width=30), secret=True)
+    telephone: str = coded(Text(width=20), secret=True)
+    customer_number: str = coded(Text(width=20), secret=True)
 
 
-INSTALLATION: Final = Struct(
-    InstallationInfo,
-    "3.2.4 si",
-    (
-        Text(name="name", width=30),
-        Text(name="street", width=30),
-        Text(name="town", width=30),
-        Text(name="telephone", width=20),
-        Text(name="customer_number", width=20),
-    ),
-)
+INSTALLATION: Final = Struct(InstallationInfo, "3.2.4 si")
 
 
 # -- rz, sz: more of the installation ----------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class ExtraParameters:
     """What ``rz`` tells."""
 
-    pulses_per_kwh_2: int
+    pulses_per_kwh_2: int = coded(Number(width=4, unit="1/kWh"))
     """Of port 2's meter; 0: as port 1."""
-    maximum_current_2: int
+    maximum_current_2: int = coded(Number(width=1, unit="A", valid=_LIMIT))
     """Of port 2, A; 0: as port 1."""
-    voltage_1: int
+    voltage_1: int = coded(Number(width=2, unit="V"))
     """V. The manual names no unit."""
-    voltage_2: int
-    compatible_1: bool
+    voltage_2: int = coded(Number(width=2, unit="V"))
+    compatible_1: bool = coded(Flag())
     """Cars that have fallen asleep are woken (3.1.1)."""
-    compatible_2: bool
-    reserved: bytes = field(repr=False)
+    compatible_2: bool = coded(Flag())
+    reserved: bytes = coded(Raw(width=53), secret=True)
     """All 0 in the manual; kept as they are."""
 
 
-EXTRA: Final = Struct(
-    ExtraParameters,
-    "3.2.4 sz",
-    (
-        Number(name="pulses_per_kwh_2", width=4, unit="1/kWh"),
-        Number(name="maximum_current_2", width=1, unit="A", valid=_LIMIT),
-        Number(name="voltage_1", width=2, unit="V"),
-        Number(name="voltage_2", width=2, unit="V"),
-        Flag(name="compatible_1"),
-        Flag(name="compatible_2"),
-        Raw(name="reserved", width=53),
-    ),
-)
+EXTRA: Final = Struct(ExtraParameters, "3.2.4 sz")
 
 
 # -- Changing ----------------------------------------------------------------------

@@ -4,14 +4,14 @@ Source of the tables: manual, 3.2.4, the command of each. Two ports a box; pairs
 port 1, port 2. Names and cards are private: no repr shows them.
 """
 
-from dataclasses import dataclass, field
 from datetime import datetime
 from enum import KEEP, IntEnum, IntFlag
 from typing import Final
 
 from ..errors import ImplausibleReplyError
-from .fields import Bits, Centivolts, Field, Flag, Moment, Number, Text, Untold
-from .structs import Struct, many, optional
+from ..fields import Field, Flag, Flags, Number, Text, Unused
+from ..structs import Struct, coded, optional, pair, record
+from .fields import Centivolts, Moment
 
 type Pair[V] = tuple[V, V]
 
@@ -22,22 +22,17 @@ _WATTS: Final = range(100_001)
 """Twice what three phases of 70 A carry: a meter counted by pulses may jump."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Card:
     """A card by which somebody has logged in."""
 
-    group: int = field(repr=False)
-    number: int = field(repr=False)
+    group: int = coded(Number(width=2), secret=True)
+    number: int = coded(Number(width=2), secret=True)
     """Within its group."""
-    user: str = field(repr=False)
+    user: str = coded(Text(width=8), secret=True)
 
 
-CARD_FIELDS: Final = (
-    Number(name="group", width=2),
-    Number(name="number", width=2),
-    Text(name="user", width=8),
-)
-CARD: Final = Struct(Card, "3.2.4 rc: card", CARD_FIELDS)
+CARD: Final = Struct(Card, "3.2.4 rc: card")
 
 
 # -- rc: the two ports -------------------------------------------------------------
@@ -86,47 +81,47 @@ class KeysAndLeds(IntFlag, boundary=KEEP):
     LED_SPARE = 1 << 7
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class PortStatus:
     """What ``rc`` tells of one port; ``None``: a mode 1 port does not know it."""
 
-    status: int
+    status: int = coded(Number(width=1))
     """Status byte, see `states`."""
-    cable_current: int | None
+    cable_current: int | None = coded(Number(width=1, unit="A", possible=_AMPERES))
     """Rated current of the cable, A; 0: none known."""
-    offered_current: int | None
+    offered_current: int | None = coded(Number(width=1, unit="A", possible=_AMPERES))
     """Highest current that the box offers now, A."""
-    flags: PortFlags
-    start_code: int
+    flags: PortFlags = coded(Flags(kind=PortFlags))
+    start_code: int = coded(Number(width=1))
     """See `start`."""
-    optimised: bool
+    optimised: bool = coded(Flag())
     """The next start is an optimised one."""
-    result_code: int
+    result_code: int = coded(Number(width=1))
     """See `result`."""
-    session_time: int
+    session_time: int = coded(Number(width=4, unit="s"))
     """Of the charge under way, s."""
-    session_energy: int
+    session_energy: int = coded(Number(width=4, unit="Wh"))
     """Of the charge under way, Wh."""
-    last_time: int
+    last_time: int = coded(Number(width=4, unit="s"))
     """Of the last charge, s."""
-    last_energy: int
+    last_energy: int = coded(Number(width=4, unit="Wh"))
     """Of the last charge, Wh."""
-    total_energy: int
+    total_energy: int = coded(Number(width=4, unit="Wh"))
     """Meter total, Wh; ``cr`` sets it."""
-    meter_cycles: int
+    meter_cycles: int = coded(Number(width=4))
     """"Absolute meter cycle counter"; no unit is named."""
-    locked: bool | None
-    contactor: bool
+    locked: bool | None = coded(Flag())
+    contactor: bool = coded(Flag())
     """The contactor is closed."""
-    rcd_tripped: bool
-    pwm_minimum: float | None
+    rcd_tripped: bool = coded(Flag())
+    pwm_minimum: float | None = coded(Centivolts())
     """Lowest level of the control pilot, V."""
-    pwm_maximum: float | None
+    pwm_maximum: float | None = coded(Centivolts())
     """Highest level of the control pilot, V."""
-    cable_voltage: float | None
+    cable_voltage: float | None = coded(Centivolts())
     """At the proximity contact, V."""
-    keys_and_leds: KeysAndLeds
-    card: Card | None = field(repr=False)
+    keys_and_leds: KeysAndLeds = coded(Flags(kind=KeysAndLeds))
+    card: Card | None = coded(optional(CARD), secret=True)
     """With which somebody has logged in at this port."""
 
     @property
@@ -153,38 +148,12 @@ _MODE_3_ONLY: Final = frozenset(
     }
 )
 
-PORT: Final = Struct(
-    PortStatus,
-    "3.2.4 rc",
-    (
-        Number(name="status", width=1),
-        Number(name="cable_current", width=1, unit="A", possible=_AMPERES),
-        Number(name="offered_current", width=1, unit="A", possible=_AMPERES),
-        Bits(name="flags", kind=PortFlags),
-        Number(name="start_code", width=1),
-        Flag(name="optimised"),
-        Number(name="result_code", width=1),
-        Number(name="session_time", width=4, unit="s"),
-        Number(name="session_energy", width=4, unit="Wh"),
-        Number(name="last_time", width=4, unit="s"),
-        Number(name="last_energy", width=4, unit="Wh"),
-        Number(name="total_energy", width=4, unit="Wh"),
-        Number(name="meter_cycles", width=4),
-        Flag(name="locked"),
-        Flag(name="contactor"),
-        Flag(name="rcd_tripped"),
-        Centivolts(name="pwm_minimum"),
-        Centivolts(name="pwm_maximum"),
-        Centivolts(name="cable_voltage"),
-        Bits(name="keys_and_leds", kind=KeysAndLeds),
-        optional("card", CARD),
-    ),
-)
+PORT: Final = Struct(PortStatus, "3.2.4 rc")
 
 
 def _mode_1(known: Field[object]) -> Field[object]:
     if known.name in _MODE_3_ONLY:
-        return Untold(name=known.name, width=known.width)
+        return Unused(name=known.name, width=known.width)
     return known
 
 
@@ -219,39 +188,27 @@ def decode_ports(
 # -- rd: more of the two ports -----------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Details:
     """What ``rd`` tells of port 1 and port 2."""
 
-    power: Pair[int]
+    power: Pair[int] = coded(pair(Number(width=4, unit="W", possible=_WATTS)))
     """W. The manual calls it energy; its unit is that of power."""
-    pwm_duty: Pair[int]
+    pwm_duty: Pair[int] = coded(pair(Number(width=1, unit="%", possible=_PERCENT)))
     """Duty cycle of the control pilot, %."""
-    pilot_code: Pair[int]
+    pilot_code: Pair[int] = coded(pair(Number(width=1)))
     """"Low-level PWM state A", raw."""
-    cable_code: Pair[int]
+    cable_code: Pair[int] = coded(pair(Number(width=1)))
     """"Low-level cable current detection in A", raw."""
-    limit: Pair[int]
+    limit: Pair[int] = coded(pair(Number(width=1, unit="A")))
     """As set with ``st``, A; 0: none. Not checked: what is too high is sent again."""
-    last_card: Pair[Card | None] = field(repr=False)
+    last_card: Pair[Card | None] = coded(pair(optional(CARD)), secret=True)
     """Who was logged in for the last charge."""
-    last_end: Pair[datetime | None]
+    last_end: Pair[datetime | None] = coded(pair(Moment()))
     """When the last charge ended, in the box's time zone."""
 
 
-DETAILS: Final = Struct(
-    Details,
-    "3.2.4 rd",
-    (
-        many(Number(name="power", width=4, unit="W", possible=_WATTS)),
-        many(Number(name="pwm_duty", width=1, unit="%", possible=_PERCENT)),
-        many(Number(name="pilot_code", width=1)),
-        many(Number(name="cable_code", width=1)),
-        many(Number(name="limit", width=1, unit="A")),
-        many(optional("last_card", CARD)),
-        many(Moment(name="last_end")),
-    ),
-)
+DETAILS: Final = Struct(Details, "3.2.4 rd")
 
 
 def decode_details(data: bytes) -> Details:
