@@ -20,14 +20,14 @@ _CURRENTS: Final = (6, 16, 10, 13)
 """A"""
 
 
-def _units(hass: Any) -> Iterator[Any]:  # noqa: ANN401 - not imported here
+def _chargers(hass: Any) -> Iterator[Any]:  # noqa: ANN401 - not imported here
     for entry in hass.config_entries.async_entries("evse_bus"):
-        yield from entry.runtime_data.units.values()
+        yield from entry.runtime_data.chargers.values()
 
 
 def _find(
     hass: Any,  # noqa: ANN401
-    unit: Any,  # noqa: ANN401
+    managed: Any,  # noqa: ANN401
     platform: str,
     key: str,
 ) -> str | None:
@@ -35,27 +35,27 @@ def _find(
     from homeassistant.helpers import entity_registry as er  # noqa: PLC0415
 
     found: str | None = er.async_get(hass).async_get_entity_id(
-        platform, "evse_bus", f"{unit.key}_{key}"
+        platform, "evse_bus", f"{managed.key}_{key}"
     )
     return found
 
 
 def _entity_of(
     hass: Any,  # noqa: ANN401
-    unit: Any,  # noqa: ANN401
+    managed: Any,  # noqa: ANN401
     platform: str,
     key: str,
 ) -> str:
     """Return the id of one of a port's entities, which must be there."""
-    if (found := _find(hass, unit, platform, key)) is None:
-        message = f"{unit.name} has no {platform} {key}"
+    if (found := _find(hass, managed, platform, key)) is None:
+        message = f"{managed.name} has no {platform} {key}"
         raise LookupError(message)
     return found
 
 
-def _is_there(hass: Any, unit: Any) -> bool:  # noqa: ANN401
+def _is_there(hass: Any, managed: Any) -> bool:  # noqa: ANN401
     """Return whether a person sees in what state a port is."""
-    entity = _find(hass, unit, "sensor", "status")
+    entity = _find(hass, managed, "sensor", "status")
     state = hass.states.get(entity) if entity else None
     return state is not None and state.state not in ("unavailable", "unknown")
 
@@ -71,7 +71,9 @@ async def _until(
     async with asyncio.timeout(patience):
         while True:
             # A look costs little; to be told of each of thousands of changes, much.
-            if all(_is_there(hass, unit) is available for unit in _units(hass)):
+            if all(
+                _is_there(hass, managed) is available for managed in _chargers(hass)
+            ):
                 return time.monotonic() - since
             await asyncio.sleep(_LOOK)
 
@@ -107,7 +109,8 @@ async def _remove(hass: Any) -> None:  # noqa: ANN401
 async def _charge(hass: Any) -> float:  # noqa: ANN401
     """Let all ports charge by one call; return how long it took, s."""
     switches = [
-        _entity_of(hass, unit, "switch", "charging_allowed") for unit in _units(hass)
+        _entity_of(hass, managed, "switch", "charging_allowed")
+        for managed in _chargers(hass)
     ]
     since = time.monotonic()
     await hass.services.async_call(
@@ -121,11 +124,11 @@ async def _statistics(hass: Any) -> dict[str, int]:  # noqa: ANN401
     total = dict.fromkeys(
         ("requests", "timeouts", "missed_deadlines", "bad_frames", "reopened"), 0
     )
-    for bus in {unit.bus for unit in _units(hass)}:
+    for bus in {managed.bus for managed in _chargers(hass)}:
         for name in total:
             total[name] += getattr(bus.wire.statistics, name)
     for entry in hass.config_entries.async_entries("evse_bus"):
-        listener = getattr(entry.runtime_data.lines, "listener", None)
+        listener = getattr(entry.runtime_data.connections, "listener", None)
         if listener is not None:
             for name in ("accepted", "crowded_out", "unidentified", "replaced"):
                 total[name] = getattr(listener.statistics, name)
@@ -146,7 +149,10 @@ async def _watch_states(
     """
     from homeassistant.core import callback  # noqa: PLC0415
 
-    ports = {_entity_of(hass, unit, platform, key): unit.part for unit in _units(hass)}
+    ports = {
+        _entity_of(hass, managed, platform, key): managed.port_number
+        for managed in _chargers(hass)
+    }
     seen: list[tuple[float, int, str]] = []
 
     @callback
@@ -172,7 +178,8 @@ async def _command(hass: Any, until: float) -> tuple[int, int]:  # noqa: ANN401
     from homeassistant.exceptions import HomeAssistantError  # noqa: PLC0415
 
     numbers = [
-        _entity_of(hass, unit, "number", "charging_current") for unit in _units(hass)
+        _entity_of(hass, managed, "number", "charging_current")
+        for managed in _chargers(hass)
     ]
     dice = random.Random(1)  # noqa: S311 - repeatable on purpose
     given = refused = 0

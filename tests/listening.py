@@ -60,7 +60,7 @@ async def listening(
 
 
 def listener_of(entry: MockConfigEntry) -> Listener:
-    return entry.runtime_data.lines.listener
+    return entry.runtime_data.connections.listener
 
 
 @contextmanager

@@ -149,6 +149,8 @@ async def scene(
     quick = patch.object(library, "LOOK_AGAIN", 0.05)
     with quick:
         async with running(hass, box, poll_interval=0.5, **data) as (entry, bus):
-            units = entry.runtime_data.units.values()
-            await wait_until(hass, lambda: all(one.charger.available for one in units))
+            chargers = entry.runtime_data.chargers.values()
+            await wait_until(
+                hass, lambda: all(one.charger.available for one in chargers)
+            )
             yield Scene(hass, entry, bus, box)

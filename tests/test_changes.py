@@ -79,7 +79,7 @@ async def test_a_longer_poll_interval_does_not_end_the_estimate(
     box = AblBox(1, car=car)
     async with running(hass, box, fail_safe_current=16.0) as (entry, _):
         await get_entity(hass, "sensor", entry, "1_status")
-        estimate = entry.runtime_data.units["abl1"].charger._energy
+        estimate = entry.runtime_data.chargers["abl1"].charger._energy
         before = estimate._longest
         change(hass, entry, "abl1", poll_interval=60.0)
         await hass.async_block_till_done()

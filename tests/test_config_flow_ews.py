@@ -135,8 +135,8 @@ async def test_box_with_one_port_is_one_charger(hass: HomeAssistant) -> None:
         assert garage.data["ports"] == 1
         assert "installation_limit_2" not in garage.data
         await hass.async_block_till_done()
-        [unit] = entry.runtime_data.units.values()
-        assert unit.name == "Garage"
+        [managed] = entry.runtime_data.chargers.values()
+        assert managed.name == "Garage"
         status = await get_entity(hass, "sensor", entry, "1_status")
         await wait_for_state(hass, status, "available")
         assert await hass.config_entries.async_unload(entry.entry_id)
@@ -200,9 +200,9 @@ async def test_nobody_answers_then_the_first_box_that_comes_is_kept(
         assert yard.data["serial"] == SERIAL
         assert yard.unique_id == f"ews_{SERIAL}"
         # From now on it is this one, and no other.
-        units = entry.runtime_data.units.values()
+        chargers = entry.runtime_data.chargers.values()
         await wait_until(
-            hass, lambda: all(one.charger.config.serial == SERIAL for one in units)
+            hass, lambda: all(one.charger.config.serial == SERIAL for one in chargers)
         )
 
         # It is shown where it can be changed, and changing a name does not lose it.

@@ -221,7 +221,7 @@ async def test_same_address_again_disturbs_nobody(hass: HomeAssistant) -> None:
         await hass.async_block_till_done()
         running = entry.runtime_data
         with dialling(entry) as dialler:
-            await wait_until(hass, lambda: running.lines.connected == 1)
+            await wait_until(hass, lambda: running.connections.connected == 1)
             flow = await Flow.change_bus(hass, entry)
             await flow.submit(where)
             assert flow.result["reason"] == "reconfigure_successful"
@@ -288,7 +288,7 @@ async def test_restricting_ends_connections_and_reloads_nothing(
         assert entry.supports_options
         running, listener = entry.runtime_data, listener_of(entry)
         with dialling(entry) as dialler:
-            await wait_until(hass, lambda: running.lines.connected == 1)
+            await wait_until(hass, lambda: running.connections.connected == 1)
             flow = await Flow.change_options(hass, entry)
             assert flow.step == "init"
             assert fields(flow) == {}
@@ -308,15 +308,15 @@ async def test_restricting_ends_connections_and_reloads_nothing(
             networks = ["192.0.2.0/24", "198.51.100.7", "2001:db8::/32"]
             assert entry.options == {"allowed": networks}
             await dialler.wait_for_async(lambda: "by the server" in dialler.dropped)
-            await wait_until(hass, lambda: running.lines.connected == 0)
+            await wait_until(hass, lambda: running.connections.connected == 0)
             attempts = dialler.attempts
             await dialler.wait_for_async(lambda: dialler.attempts > attempts + 1)
-            assert running.lines.connected == 0
+            assert running.connections.connected == 0
 
             flow = await Flow.change_options(hass, entry)
             assert fields(flow) == {"allowed": networks}
             await flow.submit({"allowed": [*networks, "127.0.0.0/8"]})
-            await wait_until(hass, lambda: running.lines.connected == 1)
+            await wait_until(hass, lambda: running.connections.connected == 1)
 
             # Without any, all may.
             flow = await Flow.change_options(hass, entry)
@@ -324,7 +324,7 @@ async def test_restricting_ends_connections_and_reloads_nothing(
             assert entry.options == {"allowed": []}
             await hass.async_block_till_done()
             assert listener.allowed == ()
-            assert running.lines.connected == 1
+            assert running.connections.connected == 1
         assert entry.runtime_data is running
         assert listener_of(entry) is listener
 

@@ -108,8 +108,8 @@ async def test_box_that_dials_is_offered_and_added(hass: HomeAssistant) -> None:
 
             # Whoever is set up is not asked about again.
             dialler.hang_up()
-            await wait_until(hass, lambda: running.lines.connected == 0)
-            await wait_until(hass, lambda: running.lines.connected == 1)
+            await wait_until(hass, lambda: running.connections.connected == 0)
+            await wait_until(hass, lambda: running.connections.connected == 1)
             assert not offers(hass)
 
 

@@ -223,14 +223,14 @@ async def test_statistics_are_told_when_somebody_looks(hass: HomeAssistant) -> N
     async with running(hass, AblBox(1)) as (entry, _):
         coordinator = entry.runtime_data
         await get_entity(hass, "sensor", entry, "1_status")
-        assert coordinator._stop_statistics is None
+        assert coordinator._unsubscribe_statistics is None
         registry = er.async_get(hass)
         requests = registry.async_get_entity_id("sensor", DOMAIN, "bus_requests")
         assert registry.async_get(requests).disabled_by
         registry.async_update_entity(requests, disabled_by=None)
         await hass.config_entries.async_reload(entry.entry_id)
         await wait_until(hass, lambda: hass.states.get(requests))
-        assert entry.runtime_data._stop_statistics is not None
+        assert entry.runtime_data._unsubscribe_statistics is not None
         coordinator = entry.runtime_data
         await hass.config_entries.async_unload(entry.entry_id)
-        assert coordinator._stop_statistics is None
+        assert coordinator._unsubscribe_statistics is None

@@ -328,7 +328,7 @@ async def test_somebody_else_sets_a_limit(hass: HomeAssistant) -> None:
         await bus.wait_for_async(lambda: limits(box)[-2:] == [10, 10])
         assert box.ports[0].limit == 10
         coordinator = entry.runtime_data
-        assert coordinator.units["ews01_1"].charger.statistics.reasserted == 1
+        assert coordinator.chargers["ews01_1"].charger.statistics.reasserted == 1
         assert state_of(hass, limit) == "10.0"
 
 

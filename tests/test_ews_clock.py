@@ -75,7 +75,7 @@ async def test_another_time_zone_counts_at_once(hass: HomeAssistant) -> None:
         await hass.config.async_update(location_name="Home")
         await polled(bus, box, 10)
         assert len(box.commands_named("sc")) == 2
-        assert entry.runtime_data.units
+        assert entry.runtime_data.chargers
 
 
 async def test_a_clock_is_set_again_after_a_power_cut(

@@ -175,7 +175,7 @@ async def test_a_box_that_is_removed(hass: HomeAssistant) -> None:
         assert device(hass, "ews01") is None
         assert child(hass, "ews01_1") is None
         assert set(by_device(hass)) == {device(hass, "bus").id}  # type: ignore[union-attr]
-        assert not entry.runtime_data.units
+        assert not entry.runtime_data.chargers
         assert not entry.runtime_data.bus.chargers
         # It is not stopped: it was only taken off.
         assert box.ports[0].contactor

@@ -244,7 +244,7 @@ async def test_nothing_private_over_the_network(
         await wait_for_state(hass, status, "unavailable")
         with socket.create_connection((HOST, entry.data["port"])) as nobody:
             nobody.sendall(b"x" * 10_000)
-            statistics = entry.runtime_data.lines.listener.statistics
+            statistics = entry.runtime_data.connections.listener.statistics
             await dialler.wait_for_async(lambda: statistics.unidentified)
         assert "did not say who it is" in caplog.text
         dialler.dial()

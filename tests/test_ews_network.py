@@ -135,7 +135,7 @@ async def test_a_new_connection_takes_the_place_of_a_half_open_one(
     box = EwsBox()
     async with listening(hass, box) as (entry, (dialler,)):
         status = await get_entity(hass, "sensor", entry, "1_status")
-        listener = entry.runtime_data.lines.listener
+        listener = entry.runtime_data.connections.listener
         dialler.vanish()
         await wait_until(hass, lambda: listener.statistics.replaced == 1)
         await wait_for_state(hass, status, "available")

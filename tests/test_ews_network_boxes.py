@@ -54,7 +54,7 @@ async def test_a_stranger_hears_who_are_you_and_nothing_else(
             assert stranger.ports[0].start_mode == 1
             assert not stranger.ports[0].contactor
         assert state_of(hass, BOXES) == "1"
-        assert entry.runtime_data.lines.listener.statistics.strangers >= 1
+        assert entry.runtime_data.connections.listener.statistics.strangers >= 1
 
 
 async def test_a_second_box_with_the_same_number_is_refused(
@@ -64,7 +64,7 @@ async def test_a_second_box_with_the_same_number_is_refused(
     async with listening(hass, box) as (entry, (dialler,)):
         status = await get_entity(hass, "sensor", entry, "1_status")
         limit = await get_entity(hass, "number", entry, "1_charging_current")
-        listener = entry.runtime_data.lines.listener
+        listener = entry.runtime_data.connections.listener
         with dialler_of(entry, double) as second:
             await second.wait_for_async(lambda: len(second.dropped) > 2, timeout=20)
             assert listener.statistics.seconds > 1
@@ -157,7 +157,7 @@ async def test_a_dead_box_does_not_delay_another(hass: HomeAssistant) -> None:
     async with listening(hass, dead, alive) as (entry, (_, other)):
         limit = await get_entity(hass, "number", entry, "1_charging_current", index=1)
         status = await get_entity(hass, "sensor", entry, "1_status", index=1)
-        silent = entry.runtime_data.units["ews01_1"].charger
+        silent = entry.runtime_data.chargers["ews01_1"].charger
         before = len(alive.commands_named("rc"))
         dead.faults.dead = True
         loop = asyncio.get_running_loop()

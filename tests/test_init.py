@@ -231,8 +231,8 @@ async def test_a_changed_set_up_is_followed_in_place(hass: HomeAssistant) -> Non
     async with running(hass, box) as (entry, bus):
         limit = await get_entity(hass, "number", entry, "charging_current")
         await call(hass, "number.set_value", limit, value=16)
-        unit = entry.runtime_data.units["abl1"]
-        before = unit.charger
+        managed = entry.runtime_data.chargers["abl1"]
+        before = managed.charger
         subentry = entry.subentries["abl1"]
         hass.config_entries.async_update_subentry(
             entry,
@@ -242,7 +242,7 @@ async def test_a_changed_set_up_is_followed_in_place(hass: HomeAssistant) -> Non
         )
         await wait_until(hass, lambda: hass.states.get(limit).attributes["max"] == 10)
         await bus.wait_for_async(lambda: box.ic_amps == pytest.approx(9.96))
-        assert unit.charger is before
+        assert managed.charger is before
         assert bus.opened == 1
         device = dr.async_get(hass).async_get_device_by_identifier(
             (DOMAIN, "abl1"), "bus"
@@ -267,15 +267,15 @@ async def test_a_new_address_makes_the_charger_anew(hass: HomeAssistant) -> None
         entry = await setup_bus(
             hass, "abl", bus.url, charger("abl", 1, serial=box.serial)
         )
-        unit = entry.runtime_data.units["abl1"]
-        orders = unit.charger.orders
+        managed = entry.runtime_data.chargers["abl1"]
+        orders = managed.charger.orders
         subentry = entry.subentries["abl1"]
         hass.config_entries.async_update_subentry(
             entry, subentry, data={**subentry.data, "address": 2}
         )
         await get_entity(hass, "sensor", entry, "1_status")
-        assert unit.charger.config.address == 2
-        assert unit.charger.orders == orders
+        assert managed.charger.config.address == 2
+        assert managed.charger.orders == orders
         assert list(entry.runtime_data.bus.chargers) == ["abl1"]
         await hass.config_entries.async_unload(entry.entry_id)
 
@@ -312,7 +312,7 @@ async def test_a_charger_that_nobody_had_a_serial_number_for(
         subentry = entry.subentries["abl1"]
         assert subentry.data["serial"] == "2W22xy00000001"
         assert subentry.unique_id == "abl_2W22xy00000001"
-        assert entry.runtime_data.units["abl1"].charger.config.serial == (
+        assert entry.runtime_data.chargers["abl1"].charger.config.serial == (
             "2W22xy00000001"
         )
         assert state_of(hass, status) == "available"

@@ -148,7 +148,7 @@ async def test_a_raise_waits_for_its_confirmation(
         bus.remove(box)
         with pytest.raises(HomeAssistantError):
             await call(hass, "number.set_value", limit, value=16)
-        assert entry.runtime_data.units[ABL].charger.orders.limit.current == 6.0
+        assert entry.runtime_data.chargers[ABL].charger.orders.limit.current == 6.0
         assert hass_storage[STORE]["data"][ABL]["limit"]["current"] == 6.0
 
 

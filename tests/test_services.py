@@ -164,8 +164,10 @@ async def test_nothing_else_is_taken(hass: HomeAssistant) -> None:
 async def test_a_box_that_is_off(hass: HomeAssistant) -> None:
     async with scene(hass) as here:
         here.box.power_off()
-        units = here.entry.runtime_data.units.values()
-        await wait_until(hass, lambda: not any(one.charger.available for one in units))
+        chargers = here.entry.runtime_data.chargers.values()
+        await wait_until(
+            hass, lambda: not any(one.charger.available for one in chargers)
+        )
         await here.refuses(
             "set_meter_total", "no_reply", 1, kind=HomeAssistantError, total=1
         )

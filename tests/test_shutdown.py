@@ -9,7 +9,7 @@ from homeassistant.const import EVENT_HOMEASSISTANT_STOP, Platform
 from homeassistant.core import HomeAssistant
 import pytest
 
-from custom_components.evse_bus import unit
+from custom_components.evse_bus import managed_charger
 from custom_components.evse_bus.evse.smartevse import PolledSmartEvse
 from tests.common import call, get_entity, running, state_of, wait_for_state
 from tests.smartevse import ACCESS, access_writes, car, shorten_quiet
@@ -26,7 +26,7 @@ async def stop(hass: HomeAssistant) -> None:
 
 @pytest.fixture
 def short_patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(unit, "PATIENCE", 0.5)
+    monkeypatch.setattr(managed_charger, "SHUTDOWN_TIMEOUT", 0.5)
 
 
 @pytest.mark.parametrize("dialect", ACCESS)
@@ -124,12 +124,12 @@ async def test_the_option_is_changed_without_an_interruption(
     async with running(hass, box) as (entry, bus):
         await get_entity(hass, "sensor", entry, "1_status")
         subentry = entry.subentries["smartevse0"]
-        charger = entry.runtime_data.units["smartevse0"].charger
+        charger = entry.runtime_data.chargers["smartevse0"].charger
         hass.config_entries.async_update_subentry(
             entry, subentry, data={**subentry.data, "stop_on_shutdown": True}
         )
         await hass.async_block_till_done()
-        assert entry.runtime_data.units["smartevse0"].charger is charger
+        assert entry.runtime_data.chargers["smartevse0"].charger is charger
         await stop(hass)
         assert access_writes(box) == [0]
         assert bus.opened == 1
@@ -148,7 +148,9 @@ async def test_a_box_that_does_not_answer_holds_nothing_up(
             await stop(hass)
         assert hass.loop.time() - begin < 4
         await bus.wait_for_async(lambda: not bus.connected)
-    assert "Charger 0 was not told that Home Assistant stops" in caplog.text
+    assert (
+        "The shutdown command to Charger 0 failed (Home Assistant stops)" in caplog.text
+    )
 
 
 async def test_an_unplugged_adapter_holds_nothing_up(
@@ -161,7 +163,9 @@ async def test_an_unplugged_adapter_holds_nothing_up(
         await wait_for_state(hass, status, "unavailable")
         await stop(hass)
         assert state_of(hass, status) == "unavailable"
-    assert "Charger 0 was not told that Home Assistant stops" in caplog.text
+    assert (
+        "The shutdown command to Charger 0 failed (Home Assistant stops)" in caplog.text
+    )
 
 
 async def fail(_charger: object, **_how: bool) -> None:
@@ -191,4 +195,5 @@ async def test_a_mistake_of_ours_holds_nothing_up(
         async with asyncio.timeout(5):
             await stop(hass)
         await bus.wait_for_async(lambda: not bus.connected)
-    assert f"Charger 0 was not told that Home Assistant stops: {said}" in caplog.text
+    message = "The shutdown command to Charger 0 failed (Home Assistant stops): "
+    assert message + said in caplog.text

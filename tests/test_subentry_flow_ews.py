@@ -202,7 +202,9 @@ async def test_name_and_limits_are_changed_in_place(hass: HomeAssistant) -> None
         with dialling(entry, box) as dialler:
             number = await get_entity(hass, "number", entry, "2_charging_current")
             assert hass.states.get(number).attributes["max"] == 16
-            ports = {unit.charger for unit in entry.runtime_data.units.values()}
+            ports = {
+                managed.charger for managed in entry.runtime_data.chargers.values()
+            }
 
             [stored] = entry.subentries.values()
             flow = await Flow.change_charger(hass, entry, stored)
@@ -237,9 +239,9 @@ async def test_name_and_limits_are_changed_in_place(hass: HomeAssistant) -> None
             assert garden.data["installation_limit_2"] == 10
             assert garden.data["fail_safe_current"] == 6
             assert garden.unique_id == f"ews_{SERIAL}"
-            units = entry.runtime_data.units.values()
-            assert {unit.charger for unit in units} == ports
-            assert [unit.name for unit in units] == ["Garden 1", "Garden 2"]
+            chargers = entry.runtime_data.chargers.values()
+            assert {managed.charger for managed in chargers} == ports
+            assert [managed.name for managed in chargers] == ["Garden 1", "Garden 2"]
             assert hass.states.get(number).attributes["max"] == 10
             assert dialler.attempts == 1
 
@@ -255,7 +257,7 @@ async def test_second_port_goes_and_comes_back(hass: HomeAssistant) -> None:
             ]
             for entity, amps in zip(numbers, (11, 9), strict=True):
                 await call(hass, "number.set_value", entity, value=amps)
-            first = entry.runtime_data.units[f"ews{SERIAL[-2:]}_1"].charger
+            first = entry.runtime_data.chargers[f"ews{SERIAL[-2:]}_1"].charger
             one_device = port_device(hass, entry, 1)
             assert one_device is not None
             assert port_device(hass, entry, 2) is not None
@@ -274,9 +276,9 @@ async def test_second_port_goes_and_comes_back(hass: HomeAssistant) -> None:
                 if one.unique_id.startswith(f"{stored.subentry_id}_2")
             ]
             # The other one has not noticed anything.
-            [unit] = entry.runtime_data.units.values()
-            assert unit.charger is first
-            assert unit.charger.available
+            [managed] = entry.runtime_data.chargers.values()
+            assert managed.charger is first
+            assert managed.charger.available
             assert state_of(hass, numbers[0]) == "11.0"
             assert port_device(hass, entry, 1) == one_device
             assert dialler.attempts == 1
@@ -293,7 +295,9 @@ async def test_second_port_goes_and_comes_back(hass: HomeAssistant) -> None:
             assert state_of(hass, back) == "6.0"
             assert hass.states.get(back).attributes["max"] == 13
             assert state_of(hass, numbers[0]) == "11.0"
-            assert entry.runtime_data.units[f"{stored.subentry_id}_1"].charger is first
+            assert (
+                entry.runtime_data.chargers[f"{stored.subentry_id}_1"].charger is first
+            )
             assert dialler.attempts == 1
             # The repair that asks for lost orders is not for it.
             assert not ir.async_get(hass).issues
@@ -314,8 +318,8 @@ async def test_another_serial_number_is_another_box(hass: HomeAssistant) -> None
             await wait_until(hass, lambda: list(offers(hass)) == [f"EWS-Box {SERIAL}"])
             assert list(listener_of(entry).peers) == [OTHER]
             await wait_for_state(hass, status, "available")
-            units = entry.runtime_data.units.values()
-            assert {unit.charger.info.serial for unit in units} == {OTHER}
+            chargers = entry.runtime_data.chargers.values()
+            assert {managed.charger.info.serial for managed in chargers} == {OTHER}
 
 
 async def test_serial_number_of_another_box_is_refused(hass: HomeAssistant) -> None:
@@ -343,4 +347,4 @@ async def test_box_that_is_removed_is_a_stranger(hass: HomeAssistant) -> None:
             assert not offers(hass)
             hass.config_entries.async_remove_subentry(entry, subentry_id)
             await offered(hass)
-            assert not entry.runtime_data.units
+            assert not entry.runtime_data.chargers

@@ -45,7 +45,7 @@ class Sharing:
 
     async def begin(self, *, new: bool = False) -> bool:
         await self.orders.async_load()
-        return await self.supply.async_begin(new=new)
+        return await self.supply.async_start(is_new=new)
 
 
 @given(amounts, amounts)
@@ -69,7 +69,7 @@ async def test_a_new_bus_shares_all_there_is(
     assert sharing.told == [25.0]
     # Nobody has said anything yet: what the installation gives may still change.
     assert hass_storage[STORE]["data"] == {"bus": {"supply": None}}
-    await sharing.supply.async_set_up(Supply(limit=32.0))
+    await sharing.supply.async_update_installed(Supply(limit=32.0))
     assert sharing.supply.limit == 32.0
 
 
@@ -105,9 +105,9 @@ async def test_it_never_exceeds_what_the_installation_gives(
     hass_storage[STORE] = stored(40.0)
     sharing = Sharing(hass)
     await sharing.begin()
-    await sharing.supply.async_set_up(Supply(limit=16.0))
-    await sharing.supply.async_set_up(Supply(limit=16.0))
-    await sharing.supply.async_set_up(Supply(limit=32.0))
+    await sharing.supply.async_update_installed(Supply(limit=16.0))
+    await sharing.supply.async_update_installed(Supply(limit=16.0))
+    await sharing.supply.async_update_installed(Supply(limit=32.0))
     assert sharing.told == [25.0, 16.0, 32.0]
     for absurd in (32.1, -1, nan, inf):
         with pytest.raises(RefusedOrderError):

@@ -1,6 +1,6 @@
-"""EVSE Bus: EV chargers on serial buses.
+"""Integration for EV chargers on serial buses.
 
-A config entry is one bus (one port), each charger on it is a config subentry.
+A config entry is one port or listener; each charger on it is a config subentry.
 """
 
 from typing import Any, Final
@@ -16,8 +16,8 @@ from homeassistant.helpers import config_validation as cv
 from homeassistant.helpers.device_registry import ChildDeviceEntry, DeviceEntry
 from homeassistant.helpers.typing import ConfigType
 
-from .configuration import made_of
-from .connections import ListenerLines
+from .configuration import rebuild_data
+from .connections import ListenerConnections
 from .const import DOMAIN
 from .coordinator import BusCoordinator, EvseBusConfigEntry
 from .discovery import (
@@ -47,16 +47,16 @@ async def async_setup(
     hass: HomeAssistant,
     config: ConfigType,  # noqa: ARG001 - there is no YAML
 ) -> bool:
-    """Set up the actions; everything else belongs to a bus."""
+    """Register the actions; everything else belongs to a config entry."""
     async_register(hass)
     return True
 
 
 async def async_setup_entry(hass: HomeAssistant, entry: EvseBusConfigEntry) -> bool:
-    """Set up a bus and the chargers on it."""
-    # There from the beginning, so that diagnostics can tell of a bus that fails.
+    """Set up a bus and its chargers from a config entry."""
+    # Set before the start, so that diagnostics also cover a bus that fails to start.
     entry.runtime_data = coordinator = BusCoordinator(hass, entry)
-    # Before a charger is spoken to: it is told also when the stop comes right then.
+    # Before the first exchange: Home Assistant may stop during the setup.
     entry.async_on_unload(
         hass.bus.async_listen_once(EVENT_HOMEASSISTANT_STOP, coordinator.async_shutdown)
     )
@@ -68,26 +68,26 @@ async def async_setup_entry(hass: HomeAssistant, entry: EvseBusConfigEntry) -> b
         listens = coordinator.bus is None
         raise not_ready(error, coordinator.port, listens=listens) from error
     except BaseException:
-        # A bus left running would hold the port against the next try.
+        # A bus left running would keep the port busy for the next attempt.
         await coordinator.async_stop()
         raise
     entry.async_on_unload(entry.add_update_listener(_async_updated))
-    if isinstance(coordinator.lines, ListenerLines):
-        listener = coordinator.lines.listener
+    if isinstance(coordinator.connections, ListenerConnections):
+        listener = coordinator.connections.listener
         entry.async_on_unload(async_follow_ignored(hass, entry, listener))
         entry.async_on_unload(async_offer_when_started(hass, entry, listener))
 
-    async def follow_time_zone(_event: Event[Any]) -> None:
-        await coordinator.async_match_subentries()
+    async def async_update_time_zone(_event: Event[Any]) -> None:
+        await coordinator.async_sync_subentries()
 
     entry.async_on_unload(
-        hass.bus.async_listen(EVENT_CORE_CONFIG_UPDATE, follow_time_zone)
+        hass.bus.async_listen(EVENT_CORE_CONFIG_UPDATE, async_update_time_zone)
     )
     return True
 
 
 async def async_unload_entry(hass: HomeAssistant, entry: EvseBusConfigEntry) -> bool:
-    """Close the port; the chargers' own fail-safe takes over."""
+    """Unload a config entry: the chargers' own fail-safe takes over."""
     unloaded = await hass.config_entries.async_unload_platforms(entry, PLATFORMS)
     if unloaded:
         await entry.runtime_data.async_stop()
@@ -95,7 +95,7 @@ async def async_unload_entry(hass: HomeAssistant, entry: EvseBusConfigEntry) -> 
 
 
 async def async_remove_entry(hass: HomeAssistant, entry: EvseBusConfigEntry) -> None:
-    """Delete the stored orders of a bus that is no more, and what it offered."""
+    """Delete the stored orders and the discovery flows of a removed entry."""
     async_listener_gone(hass, entry)
     await OrderStore(hass, entry.entry_id).async_remove()
 
@@ -105,20 +105,20 @@ async def async_remove_config_entry_device(
     entry: EvseBusConfigEntry,
     device: DeviceEntry | ChildDeviceEntry,
 ) -> bool:
-    """Return whether a device may be deleted: only a connector that is gone."""
+    """Return whether a device may be removed: only that of a missing connector."""
     if entry.state is not ConfigEntryState.LOADED:
-        # Nobody knows what is still there.
+        # Which connectors exist is known only while the bus runs.
         return False
-    return entry.runtime_data.forget_connector(
+    return entry.runtime_data.remove_device(
         {key for domain, key in device.identifiers if domain == DOMAIN}
     )
 
 
 async def _async_updated(hass: HomeAssistant, entry: EvseBusConfigEntry) -> None:
-    """Follow a changed set-up, without silencing chargers that did not change."""
+    """Apply a changed config entry; unchanged chargers are polled without a break."""
     coordinator = entry.runtime_data
-    if made_of(entry.data) != coordinator.data:
+    if rebuild_data(entry.data) != coordinator.rebuild_data:
         hass.config_entries.async_schedule_reload(entry.entry_id)
         return
-    await coordinator.async_follow_supply()
-    await coordinator.async_match_subentries()
+    await coordinator.async_update_supply()
+    await coordinator.async_sync_subentries()

@@ -25,8 +25,8 @@ from .evse.bus import Bus
 from .evse.duty import Duty
 from .evse.model import Capability, Fault
 from .evse.readings import ChargerReading, ConnectorReading
+from .managed_charger import ManagedCharger
 from .sensor_tables import WAITING
-from .unit import ChargerUnit
 
 PARALLEL_UPDATES = 0
 
@@ -154,31 +154,31 @@ async def async_setup_entry(
     coordinator = entry.runtime_data
     if coordinator.bus is not None:
         async_add_entities([ConnectedSensor(coordinator, coordinator.bus)])
-    if (duty := coordinator.lines.duty) is not None:
+    if (duty := coordinator.connections.duty) is not None:
         async_add_entities([SecondMasterSensor(coordinator, duty)])
     add_charger_entities(
-        Platform.BINARY_SENSOR, entry, async_add_entities, _sensors, _unwanted
+        Platform.BINARY_SENSOR, entry, async_add_entities, _sensors, _obsolete
     )
 
 
 def _sensors(
-    coordinator: BusCoordinator, unit: ChargerUnit
+    coordinator: BusCoordinator, managed: ManagedCharger
 ) -> Iterable[BinarySensorEntity]:
-    charger = unit.charger
-    yield ProblemSensor(coordinator, unit, PROBLEM)
-    if unit.leads and coordinator.bus is None:
-        yield BoxConnectedSensor(coordinator, unit)
-    for box_description in supported(unit, BOX_SENSORS):
-        yield BoxBinarySensor(coordinator, unit, box_description)
+    charger = managed.charger
+    yield ProblemSensor(coordinator, managed, PROBLEM)
+    if managed.is_primary_port and coordinator.bus is None:
+        yield BoxConnectedSensor(coordinator, managed)
+    for box_description in supported(managed, BOX_SENSORS):
+        yield BoxBinarySensor(coordinator, managed, box_description)
     if charger.config.order_lifetime is not None:
-        yield OrdersExpiredSensor(coordinator, unit, ORDERS_EXPIRED)
-    for number in sorted(unit.numbers):
-        for description in supported(unit, CONNECTOR_SENSORS):
-            yield ConnectorBinarySensor(coordinator, unit, number, description)
+        yield OrdersExpiredSensor(coordinator, managed, ORDERS_EXPIRED)
+    for number in sorted(managed.connector_numbers):
+        for description in supported(managed, CONNECTOR_SENSORS):
+            yield ConnectorBinarySensor(coordinator, managed, number, description)
 
 
-def _unwanted(unit: ChargerUnit) -> Iterable[str]:
-    expire = unit.charger.config.order_lifetime is not None
+def _obsolete(managed: ManagedCharger) -> Iterable[str]:
+    expire = managed.charger.config.order_lifetime is not None
     return () if expire else (ORDERS_EXPIRED.key,)
 
 
@@ -191,7 +191,7 @@ class ConnectedSensor(BusEntity, BinarySensorEntity):
         self._bus = bus
 
     @override
-    def show(self) -> Hashable:
+    def update_attributes(self) -> Hashable:
         """Show whether bytes can go out."""
         self._attr_is_on = self._bus.connected
         return self._attr_is_on
@@ -200,9 +200,9 @@ class ConnectedSensor(BusEntity, BinarySensorEntity):
 class BoxConnectedSensor(ChargerEntity, BinarySensorEntity):
     """Whether a box that dials us is connected."""
 
-    def __init__(self, coordinator: BusCoordinator, unit: ChargerUnit) -> None:
+    def __init__(self, coordinator: BusCoordinator, managed: ManagedCharger) -> None:
         """Belong to the box."""
-        super().__init__(coordinator, unit, CONNECTED, whole=True)
+        super().__init__(coordinator, managed, CONNECTED, whole=True)
 
     @override
     def is_available(self) -> bool:
@@ -210,9 +210,9 @@ class BoxConnectedSensor(ChargerEntity, BinarySensorEntity):
         return True
 
     @override
-    def show(self) -> Hashable:
+    def update_attributes(self) -> Hashable:
         """Show whether it is connected."""
-        self._attr_is_on = self.unit.bus.connected
+        self._attr_is_on = self.managed.bus.connected
         return self._attr_is_on
 
 
@@ -222,15 +222,15 @@ class BoxBinarySensor(ChargerEntity, BinarySensorEntity):
     def __init__(
         self,
         coordinator: BusCoordinator,
-        unit: ChargerUnit,
+        managed: ManagedCharger,
         description: BoxBinarySensorDescription,
     ) -> None:
         """Belong to the box."""
-        super().__init__(coordinator, unit, description, whole=description.whole)
+        super().__init__(coordinator, managed, description, whole=description.whole)
         self._value = description.value
 
     @override
-    def show(self) -> Hashable:
+    def update_attributes(self) -> Hashable:
         """Show what the box said."""
         reading = self.charger.reading
         self._attr_is_on = None if reading is None else self._value(reading)
@@ -246,7 +246,7 @@ class SecondMasterSensor(BusEntity, BinarySensorEntity):
         self._duty = duty
 
     @override
-    def show(self) -> Hashable:
+    def update_attributes(self) -> Hashable:
         """Show what was noticed."""
         self._attr_is_on = Fault.SECOND_MASTER in self._duty.noticed
         return self._attr_is_on
@@ -264,7 +264,7 @@ class ProblemSensor(ChargerEntity, BinarySensorEntity):
         return self.charger.available or bool(self.charger.noticed)
 
     @override
-    def show(self) -> Hashable:
+    def update_attributes(self) -> Hashable:
         """Show whether there is a fault."""
         self._attr_is_on = bool(self.charger.faults - WAITING)
         return self._attr_is_on
@@ -274,7 +274,7 @@ class OrdersExpiredSensor(ChargerEntity, BinarySensorEntity):
     """Whether the fail-safe counts because nobody has renewed the orders."""
 
     @override
-    def show(self) -> Hashable:
+    def update_attributes(self) -> Hashable:
         """Show whether the orders' lifetime is over."""
         self._attr_is_on = self.charger.orders_expired
         return self._attr_is_on
@@ -286,16 +286,16 @@ class ConnectorBinarySensor(ConnectorEntity, BinarySensorEntity):
     def __init__(
         self,
         coordinator: BusCoordinator,
-        unit: ChargerUnit,
+        managed: ManagedCharger,
         number: int,
         description: ConnectorBinarySensorDescription,
     ) -> None:
         """Be told with the connector."""
-        super().__init__(coordinator, unit, number, description)
+        super().__init__(coordinator, managed, number, description)
         self._value = description.value
 
     @override
-    def show(self) -> Hashable:
+    def update_attributes(self) -> Hashable:
         """Show what the charger said."""
         reading = self.reading
         value = None if reading is None else self._value(reading)

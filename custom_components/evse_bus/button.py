@@ -14,7 +14,7 @@ from .coordinator import BusCoordinator, EvseBusConfigEntry
 from .entity import ChargerEntity, add_charger_entities, supported
 from .errors import translated_errors
 from .evse.model import Capability, Command
-from .unit import ChargerUnit
+from .managed_charger import ManagedCharger
 
 PARALLEL_UPDATES = 0
 
@@ -69,9 +69,11 @@ async def async_setup_entry(
     add_charger_entities(Platform.BUTTON, entry, async_add_entities, _buttons)
 
 
-def _buttons(coordinator: BusCoordinator, unit: ChargerUnit) -> Iterable[ButtonEntity]:
-    for description in supported(unit, BUTTONS):
-        yield CommandButton(coordinator, unit, description)
+def _buttons(
+    coordinator: BusCoordinator, managed: ManagedCharger
+) -> Iterable[ButtonEntity]:
+    for description in supported(managed, BUTTONS):
+        yield CommandButton(coordinator, managed, description)
 
 
 class CommandButton(ChargerEntity, ButtonEntity):
@@ -80,20 +82,20 @@ class CommandButton(ChargerEntity, ButtonEntity):
     def __init__(
         self,
         coordinator: BusCoordinator,
-        unit: ChargerUnit,
+        managed: ManagedCharger,
         description: CommandButtonDescription,
     ) -> None:
         """Belong to the charger."""
-        super().__init__(coordinator, unit, description, whole=description.whole)
+        super().__init__(coordinator, managed, description, whole=description.whole)
         self._command = description.command
 
     @override
-    def show(self) -> Hashable:
+    def update_attributes(self) -> Hashable:
         """Show nothing but that it is there."""
         return None
 
     @override
     async def async_press(self) -> None:
         """Tell the charger; return when it is known to have worked."""
-        with translated_errors(self.unit.name, self.coordinator.port):
+        with translated_errors(self.managed.name, self.coordinator.port):
             await self.charger.command(self._command)

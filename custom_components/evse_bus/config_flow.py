@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import Any, Final, override
 
 from homeassistant.config_entries import (
-    ConfigEntry,
     ConfigEntryState,
     ConfigFlowResult,
     ConfigSubentryData,
@@ -26,6 +25,7 @@ from .const import (
     DOMAIN,
     SUBENTRY_CHARGER,
 )
+from .coordinator import EvseBusConfigEntry
 from .evse.errors import RefusedOrderError
 from .evse.found import ScanReport
 from .evse.protocol import Progress, Protocol
@@ -78,7 +78,7 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
     @callback
     @override
     def async_get_supported_subentry_types(
-        cls, config_entry: ConfigEntry
+        cls, config_entry: EvseBusConfigEntry
     ) -> dict[str, type[ConfigSubentryFlow]]:
         """Return what can be added to a bus."""
         # A box that is ignored is an entry, too: one without anything in it.
@@ -89,7 +89,7 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
     @classmethod
     @callback
     @override
-    def async_supports_options_flow(cls, config_entry: ConfigEntry) -> bool:
+    def async_supports_options_flow(cls, config_entry: EvseBusConfigEntry) -> bool:
         """Return whether it listens: only then there is something to restrict."""
         return CONF_PROTOCOL in config_entry.data and (
             protocol_of(config_entry.data).dials_in
@@ -98,7 +98,7 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
     @staticmethod
     @callback
     @override
-    def async_get_options_flow(config_entry: ConfigEntry) -> OptionsFlow:
+    def async_get_options_flow(config_entry: EvseBusConfigEntry) -> OptionsFlow:
         """Return the dialogue about who may dial."""
         return ListenerOptionsFlow()
 
@@ -187,7 +187,7 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
         self,
         protocol: Protocol,
         typed: dict[str, Any],
-        entry: ConfigEntry | None = None,
+        entry: EvseBusConfigEntry | None = None,
     ) -> Errors:
         """Set `bus_data`, or return what is wrong; ``entry`` is being changed.
 

@@ -1,4 +1,4 @@
-"""From what the config flow stored to what the library is set up with. Pure."""
+"""From the data of config entries to the configuration of the library. Pure."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
@@ -48,15 +48,15 @@ _OPTIONAL_FIELDS: Final[Mapping[str, Callable[[Any], object]]] = {
     CONF_VOLTAGE: float,
     CONF_POLL_INTERVAL: float,
     CONF_ORDER_LIFETIME: lambda minutes: float(minutes) * 60,
-    # What single protocols add.
+    # Fields of single protocols.
     CONF_COMMAND: int,
     CONF_INFORMATION: bytes.fromhex,
     CONF_PHASE_ORDER: tuple,
     CONF_STOP_ON_SHUTDOWN: bool,
 }
-"""Fields that may be missing or None, and how they are made of what is stored."""
+"""Fields that may be missing or None, with the conversion of the stored value."""
 
-_IN_PLACE: Final = (
+_LIVE_FIELDS: Final = (
     "name",
     "installation_limit",
     "voltage",
@@ -65,34 +65,34 @@ _IN_PLACE: Final = (
     "stop_on_shutdown",
     "time_zone",
 )
-"""What of its set-up a charger looks up anew each time."""
-_BUS_IN_PLACE: Final = (CONF_SUPPLY_LIMIT, CONF_SUPPLY_MINIMUM)
-"""What can be changed while the bus runs: anew it would be silent for a while."""
+"""Fields that a charger reads from its configuration at each use."""
+_LIVE_KEYS: Final = (CONF_SUPPLY_LIMIT, CONF_SUPPLY_MINIMUM)
+"""Keys that can change while the bus runs: a new bus would be silent for a while."""
 
 _DEFAULT_TIMEOUT: Final = 60
 
 PORT_LIMITS: Final = (CONF_INSTALLATION_LIMIT, CONF_INSTALLATION_LIMIT_2)
-"""Where the installation limit of each port of a box stands."""
+"""Keys of the installation limits of a box's ports."""
 _FAMILIES: Final = {"ews_network": "ews"}
-"""Protocols under which one box may be found by the same serial number."""
+"""Protocols that share serial numbers with another one: the same boxes speak both."""
 
 
 def protocol_of(data: Mapping[str, Any]) -> Protocol:
-    """Return the protocol that a config entry's data names."""
+    """Return the protocol of a config entry's data."""
     return PROTOCOLS[data[CONF_PROTOCOL]]
 
 
 def charger_unique_id(
     protocol: str, serial: str | None, address: int | str | None = None
 ) -> str:
-    """Return a charger subentry's unique id: its identity, else its address."""
+    """Return the unique id of a charger's subentry: by serial number, else address."""
     if serial is None:
         return f"{protocol}_address_{address}"
     return f"{_FAMILIES.get(protocol, protocol)}_{serial}"
 
 
 def line_settings(data: Mapping[str, Any]) -> LineSettings:
-    """Return how the port is opened: the protocol's way, unless overridden."""
+    """Return the line settings: those of the protocol, unless overridden."""
     usual = protocol_of(data).settings
     return LineSettings(
         baudrate=int(data.get(CONF_BAUDRATE, usual.baudrate)),
@@ -101,13 +101,13 @@ def line_settings(data: Mapping[str, Any]) -> LineSettings:
     )
 
 
-def made_of(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what of a config entry's data its bus has to be made anew for."""
-    return {key: value for key, value in data.items() if key not in _BUS_IN_PLACE}
+def rebuild_data(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entry data whose change requires a new bus."""
+    return {key: value for key, value in data.items() if key not in _LIVE_KEYS}
 
 
 def supply_of(data: Mapping[str, Any]) -> Supply | None:
-    """Return what the chargers of a bus share; ``None``: each is on its own."""
+    """Return the supply that the chargers share; ``None``: they share none."""
     if protocol_of(data).duty is None:
         return None
     return Supply(
@@ -119,10 +119,10 @@ def supply_of(data: Mapping[str, Any]) -> Supply | None:
 def charger_configs(
     data: Mapping[str, Any], subentry: ConfigSubentry, zone: tzinfo | None = None
 ) -> list[ChargerConfig]:
-    """Return the set-up of a box, one for each port that is a charger of its own.
+    """Return the configurations of a box: one for each port that is in use.
 
-    ``data`` is the config entry's, for the protocol; ``zone`` is for the clocks of
-    boxes that have one.
+    ``data`` is that of the config entry; ``zone`` sets the clock of a box that has
+    one.
     """
     stored = subentry.data
     protocol = protocol_of(data)
@@ -156,15 +156,15 @@ def charger_configs(
 
 
 def port_count(stored: Mapping[str, Any]) -> int:
-    """Return how many ports of a box are used."""
+    """Return how many ports of a box are used, from its subentry's data."""
     return int(stored.get(CONF_PORTS, 1))
 
 
-def first_orders(subentry: ConfigSubentry, config: ChargerConfig) -> Orders:
-    """Return the orders of a charger that never had any.
+def initial_orders(subentry: ConfigSubentry, config: ChargerConfig) -> Orders:
+    """Return the first orders of a charger.
 
-    They are the fail-safe values that the user confirmed when adding it. Nobody
-    has said yet whether it may charge, so permission is the charger's own.
+    They are the fail-safe values that the user confirmed when adding it. Permission
+    is not set, so the charger keeps its own.
     """
     stored = subentry.data
     fail_safe = min(
@@ -179,12 +179,12 @@ def first_orders(subentry: ConfigSubentry, config: ChargerConfig) -> Orders:
 
 
 def changes_in_place(old: ChargerConfig, new: ChargerConfig) -> bool:
-    """Return whether a charger can be told its new set-up while it runs.
+    """Return whether a running charger can take a new configuration.
 
-    What decides how it is spoken to is asked for once, when it is made. A serial
-    number that becomes known is the one it has found itself.
+    All but the `_LIVE_FIELDS` are read once, when the charger is created. A serial
+    number that was not set before is the one the charger has read itself.
     """
-    names = {one.name for one in fields(old)}.intersection(_IN_PLACE)
+    names = {one.name for one in fields(old)}.intersection(_LIVE_FIELDS)
     if old.serial is None:
         names.add("serial")
     same = {name: getattr(old, name) for name in names}

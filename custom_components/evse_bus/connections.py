@@ -1,78 +1,73 @@
-"""The lines of one config entry: one port, or a listener that boxes dial.
+"""The connections of one config entry: a port, or a listener that boxes dial.
 
-A port has one bus for all chargers. With a listener each box has a line, and so a bus
-and a scheduler, of its own: one that is slow or gone holds up nobody else.
+A port has one bus for all its chargers. Behind a listener each box has a connection,
+and so a bus and a scheduler, of its own: a slow or dead box delays no other.
 """
 
 from abc import ABC, abstractmethod
 import asyncio
 from collections.abc import Callable, Iterable, Mapping
-from ipaddress import ip_network
-from typing import TYPE_CHECKING, Any, override
+from ipaddress import IPv4Network, IPv6Network, ip_network
+from typing import Any, override
 
+from homeassistant.config_entries import ConfigEntry
 from homeassistant.const import CONF_DEVICE, CONF_HOST, CONF_PORT
 
 from .configuration import line_settings, protocol_of, supply_of
 from .const import CONF_ALLOWED
+from .evse.bus import Bus
+from .evse.duty import Duty
 from .evse.ews import Listener, Stranger
-
-if TYPE_CHECKING:
-    from ipaddress import IPv4Network, IPv6Network
-
-    from homeassistant.config_entries import ConfigEntry
-
-    from .evse.bus import Bus
-    from .evse.duty import Duty
-    from .evse.model import ChargerConfig
+from .evse.model import ChargerConfig
 
 
-class Lines(ABC):
-    """All lines of one config entry."""
+class Connections(ABC):
+    """All connections of one config entry."""
 
     name: str
-    """Of the port or address, for messages."""
+    """Port or address, for messages."""
 
     @property
     @abstractmethod
-    def only(self) -> Bus | None:
-        """Return the one bus of a port; ``None``: each box has its own."""
+    def shared_bus(self) -> Bus | None:
+        """Return the bus of all chargers; ``None``: each box has its own."""
 
     @property
     def duty(self) -> Duty | None:
-        """Return what the bus owes to all its chargers at once."""
-        return None if self.only is None else self.only.duty
+        """Return the master of the shared bus, if the protocol has one."""
+        return None if self.shared_bus is None else self.shared_bus.duty
 
     @abstractmethod
     async def start(self) -> None:
-        """Open them; raises LineError. Chargers that are there begin to be asked."""
+        """Open the port or listener and start polling; raises LineError."""
 
     @abstractmethod
     async def stop(self) -> None:
-        """Close them and leave nothing behind."""
+        """Stop all buses and close the port or listener."""
 
     @abstractmethod
-    async def join(self, config: ChargerConfig, name: str) -> Bus:
-        """Return the bus of a charger, which is then to be put on it.
+    async def acquire_bus(self, config: ChargerConfig, name: str) -> Bus:
+        """Return the bus that a charger is to be added to.
 
         ``name``: of its box, for messages.
         """
 
-    async def leave(self, bus: Bus) -> None:  # noqa: B027 - a port keeps its bus
-        """Take note that a charger was taken off a bus."""
+    async def release_bus(self, bus: Bus) -> None:  # noqa: B027 - a port keeps its bus
+        """Stop a bus that has no charger left, unless the connection keeps it."""
 
     def rename(self, name: str) -> None:  # noqa: B027 - boxes have names of their own
-        """Follow a new name of the config entry."""
+        """Apply a new title of the config entry."""
 
-    def follow_options(self, options: Mapping[str, Any]) -> None:  # noqa: B027
-        """Follow changed options of the config entry."""
+    def update_options(self, options: Mapping[str, Any]) -> None:  # noqa: B027
+        """Apply changed options of the config entry."""
 
 
-class PortLines(Lines):
+class PortConnection(Connections):
     """One port, and one bus on it."""
 
     def __init__(self, entry: ConfigEntry) -> None:
-        """Open nothing yet."""
-        self.name = line_name(entry.data)
+        """Create the bus; the port is not opened."""
+        self.name = connection_name(entry.data)
         self._bus = protocol_of(entry.data).bus(
             self.name,
             settings=line_settings(entry.data),
@@ -82,7 +77,7 @@ class PortLines(Lines):
 
     @property
     @override
-    def only(self) -> Bus:
+    def shared_bus(self) -> Bus:
         return self._bus
 
     @override
@@ -94,7 +89,7 @@ class PortLines(Lines):
         await self._bus.stop()
 
     @override
-    async def join(self, config: ChargerConfig, name: str) -> Bus:
+    async def acquire_bus(self, config: ChargerConfig, name: str) -> Bus:
         return self._bus
 
     @override
@@ -102,26 +97,29 @@ class PortLines(Lines):
         self._bus.name = name
 
 
-class ListenerLines(Lines):
-    """A listener, and one bus for each box that is set up."""
+class ListenerConnections(Connections):
+    """A listener, and one bus for each configured box."""
 
     def __init__(
-        self, entry: ConfigEntry, on_stranger: Callable[[Stranger], None]
+        self, entry: ConfigEntry, on_unknown_box: Callable[[Stranger], None]
     ) -> None:
-        """Listen to nobody yet; ``on_stranger`` is told of boxes that are not set up."""
-        self.name = line_name(entry.data)
+        """Create the listener; it does not accept connections yet.
+
+        ``on_unknown_box`` is called with each box that dials and is not configured.
+        """
+        self.name = connection_name(entry.data)
         self.listener = Listener(
             entry.data[CONF_HOST],
             entry.data[CONF_PORT],
             allowed=allowed_networks(entry.options),
-            on_stranger=on_stranger,
+            on_stranger=on_unknown_box,
         )
         self._buses: dict[str, Bus] = {}
         self._started = False
 
     @property
     @override
-    def only(self) -> None:
+    def shared_bus(self) -> None:
         return None
 
     @property
@@ -140,11 +138,11 @@ class ListenerLines(Lines):
     async def stop(self) -> None:
         self._started = False
         await self.listener.stop()
-        # One that is in the midst of something does not hold up the others.
-        await asyncio.gather(*(self._forget(serial) for serial in tuple(self._buses)))
+        # Concurrently: a box in the middle of an exchange must not delay the others.
+        await asyncio.gather(*(self._remove(serial) for serial in tuple(self._buses)))
 
     @override
-    async def join(self, config: ChargerConfig, name: str) -> Bus:
+    async def acquire_bus(self, config: ChargerConfig, name: str) -> Bus:
         serial = config.serial or ""
         bus = self._buses[serial] = self.listener.expect(serial, name)
         if self._started:
@@ -152,37 +150,39 @@ class ListenerLines(Lines):
         return bus
 
     @override
-    async def leave(self, bus: Bus) -> None:
+    async def release_bus(self, bus: Bus) -> None:
         if bus.chargers:
             return
-        for serial, known in tuple(self._buses.items()):
-            if known is bus:
-                await self._forget(serial)
+        for serial, candidate in tuple(self._buses.items()):
+            if candidate is bus:
+                await self._remove(serial)
 
-    async def _forget(self, serial: str) -> None:
+    async def _remove(self, serial: str) -> None:
         del self._buses[serial]
         await self.listener.forget(serial)
 
     @override
-    def follow_options(self, options: Mapping[str, Any]) -> None:
+    def update_options(self, options: Mapping[str, Any]) -> None:
         self.listener.allow(allowed_networks(options))
 
 
-def lines_of(entry: ConfigEntry, on_stranger: Callable[[Stranger], None]) -> Lines:
-    """Return the lines of a config entry; nothing is opened yet."""
+def make_connections(
+    entry: ConfigEntry, on_unknown_box: Callable[[Stranger], None]
+) -> Connections:
+    """Return the connections of a config entry; nothing is opened."""
     if protocol_of(entry.data).dials_in:
-        return ListenerLines(entry, on_stranger)
-    return PortLines(entry)
+        return ListenerConnections(entry, on_unknown_box)
+    return PortConnection(entry)
 
 
 def allowed_networks(options: Mapping[str, Any]) -> list[IPv4Network | IPv6Network]:
-    """Return which networks may dial in; none: all may."""
+    """Return the networks whose boxes may dial in; empty: all."""
     stored: Iterable[str] = options.get(CONF_ALLOWED, ())
     return [ip_network(one) for one in stored]
 
 
-def line_name(data: Mapping[str, Any]) -> str:
-    """Return the name of the port or address of a config entry, for messages."""
+def connection_name(data: Mapping[str, Any]) -> str:
+    """Return the port or address of a config entry, for messages."""
     if protocol_of(data).dials_in:
         return address_name(data[CONF_HOST], data[CONF_PORT])
     device: str = data[CONF_DEVICE]
@@ -190,5 +190,5 @@ def line_name(data: Mapping[str, Any]) -> str:
 
 
 def address_name(host: str, port: int) -> str:
-    """Return an address and port as people write them."""
+    """Return ``host:port``, with brackets around an IPv6 address."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

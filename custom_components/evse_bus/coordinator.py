@@ -1,8 +1,8 @@
-"""One bus in Home Assistant: its chargers, their orders, and who is told what.
+"""Coordinator of one bus: its chargers, their stored orders, their entities.
 
-It pushes: the bus decides when a charger is asked. Who listens does so for one
-context (the bus, its statistics, a charger, a connector), and is called only
-when something of that context changed.
+The library polls the chargers by its own schedule and calls back when something has
+changed. An entity listens in one context (the bus, its statistics, a charger or a
+connector) and is called only for changes in that context.
 """
 
 import asyncio
@@ -21,347 +21,340 @@ from .configuration import (
     changes_in_place,
     charger_configs,
     charger_unique_id,
-    first_orders,
-    made_of,
+    initial_orders,
     protocol_of,
+    rebuild_data,
     supply_of,
 )
-from .connections import lines_of
+from .connections import make_connections
 from .const import CONF_SERIAL, LOGGER, SUBENTRY_CHARGER
-from .devices import BusDevices, connector_key
+from .devices import BusDevices
 from .discovery import async_set_up_now, async_wants_to_connect
 from .evse.bus import Bus
 from .evse.ews import EwsPort
 from .evse.listeners import tell
 from .evse.model import ChargerConfig, Orders, Supply
 from .issues import BusIssues
+from .managed_charger import ManagedCharger, async_shut_down_chargers
 from .orders import OrderStore, async_run_uncancelled
 from .supply import SharedSupply
-from .unit import ChargerUnit, async_say_farewell
 
 type EvseBusConfigEntry = ConfigEntry[BusCoordinator]
 type Context = tuple[str, int | None]
-"""What a listener is interested in."""
+"""Key of a managed charger and number of a connector, or one of the two below."""
 
 BUS: Final[Context] = ("bus", None)
 STATISTICS: Final[Context] = ("statistics", None)
 STATISTICS_INTERVAL: Final = timedelta(seconds=30)
-"""Counters change with every exchange; they are told this often."""
+"""Counters change with every exchange; their listeners are called this often."""
 
 
 class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
-    """One bus."""
+    """Class to manage one bus and the chargers on it."""
+
+    config_entry: EvseBusConfigEntry
 
     def __init__(self, hass: HomeAssistant, entry: EvseBusConfigEntry) -> None:
-        """Prepare the bus; nothing is opened or read yet."""
+        """Initialize the coordinator; nothing is opened or read."""
         self.hass = hass
-        self.entry = entry
-        self.data = made_of(entry.data)
-        """What the bus was made of: when that changes, it is made anew."""
+        self.config_entry = entry
+        self.rebuild_data = rebuild_data(entry.data)
+        """Entry data the bus was made from; a change requires a new bus."""
         self.protocol = protocol_of(entry.data)
-        self.lines = lines_of(entry, partial(async_wants_to_connect, hass, entry))
-        installed = supply_of(entry.data)
-        self.units: dict[str, ChargerUnit] = {}
+        self.connections = make_connections(
+            entry, partial(async_wants_to_connect, hass, entry)
+        )
+        self.chargers: dict[str, ManagedCharger] = {}
         self.issues = BusIssues(hass, entry)
         self.devices = BusDevices(hass, entry, self.protocol.name)
         self.orders = OrderStore(hass, entry.entry_id, self.issues.orders_written)
-        self.supply = (
-            SharedSupply(installed, self.orders, self._async_share)
-            if installed
-            else None
-        )
-        """What the chargers share; ``None``: each is on its own."""
+        self.supply: SharedSupply | None = None
+        """What the chargers share; ``None``: they share nothing."""
+        if (installed := supply_of(entry.data)) is not None:
+            self.supply = SharedSupply(installed, self.orders, self._async_apply_supply)
         self._listeners: dict[Context, list[CALLBACK_TYPE]] = {}
-        self._adders: list[Callable[[ChargerUnit], None]] = []
-        self._stop_statistics: CALLBACK_TYPE | None = None
+        self._platforms: list[Callable[[ManagedCharger], None]] = []
         self._unsubscribe: list[CALLBACK_TYPE] = []
-        self._changing = asyncio.Lock()
+        self._unsubscribe_statistics: CALLBACK_TYPE | None = None
+        self._lock = asyncio.Lock()
+        """Held while chargers are added, changed or removed, and while stopping."""
         self._stopped = False
 
     @property
     def bus(self) -> Bus | None:
         """Return the bus of all chargers; ``None``: each box has its own."""
-        return self.lines.only
+        return self.connections.shared_bus
 
     @property
     def port(self) -> str:
         """Return the name of the port or address, for messages."""
-        return self.lines.name
+        return self.connections.name
 
-    # -- Life --------------------------------------------------------------------
+    # -- Start and stop ----------------------------------------------------------
 
     async def async_start(self) -> None:
-        """Load the orders, then open the port; raises LineError."""
+        """Load the orders and open the port; raises LineError."""
         await self.orders.async_load()
-        await self._async_begin_sharing()
-        await self.async_match_subentries()
+        await self._async_start_supply()
+        await self.async_sync_subentries()
         if self.bus is not None:
             self._unsubscribe.append(self.bus.subscribe(partial(self._notify, BUS)))
-        await self.lines.start()
+        await self.connections.start()
 
-    async def _async_begin_sharing(self) -> None:
-        if self.supply is None or self.lines.duty is None:
+    async def _async_start_supply(self) -> None:
+        if self.supply is None or self.connections.duty is None:
             return
-        # Its device outlives restarts: there is one, so there was an order.
-        new = not self.devices.has(self.entry.entry_id)
-        if not await self.supply.async_begin(new=new):
+        # The device registry outlives restarts: a known bus must have a stored order.
+        is_new = not self.devices.has(self.config_entry.entry_id)
+        if not await self.supply.async_start(is_new=is_new):
             self.issues.supply_lost(self.supply.limit)
-        self._unsubscribe.append(self.lines.duty.subscribe(self._on_duty))
+        self._unsubscribe.append(self.connections.duty.subscribe(self._on_duty))
 
     async def async_shutdown(self, _event: Event) -> None:
-        """Stop with Home Assistant: chargers that are to be told so are told."""
-        await async_say_farewell([unit.charger for unit in self.units.values()])
+        """Send the shutdown commands and stop, when Home Assistant stops."""
+        await async_shut_down_chargers(
+            [managed.charger for managed in self.chargers.values()]
+        )
         await self.async_stop()
 
     async def async_stop(self) -> None:
-        """Close the port and leave nothing behind."""
-        async with self._changing:
+        """Close the port, end all subscriptions and write pending orders."""
+        async with self._lock:
             self._stopped = True
             while self._unsubscribe:
                 self._unsubscribe.pop()()
-            await self.lines.stop()
-            for unit in self.units.values():
-                unit.unsubscribe()
-                unit.unsubscribe = lambda: None
+            await self.connections.stop()
+            for managed in self.chargers.values():
+                managed.unsubscribe()
             await self.orders.async_close()
             self.issues.clear()
 
-    # -- What all chargers share -------------------------------------------------
+    # -- Shared supply -----------------------------------------------------------
 
-    async def async_follow_supply(self) -> None:
-        """Share what the set-up says now."""
-        installed = supply_of(self.entry.data)
+    async def async_update_supply(self) -> None:
+        """Apply the supply of the entry data, which may have changed."""
+        installed = supply_of(self.config_entry.data)
         if self.supply is not None and installed is not None:
-            await self.supply.async_set_up(installed)
+            await self.supply.async_update_installed(installed)
 
     async def async_order_supply(self, value: float) -> None:
-        """Let the chargers share this much, A a phase; raises RefusedOrderError."""
+        """Limit the sum of all chargers, A per phase; raises RefusedOrderError."""
         if self.supply is not None:
-            # What is on disk must count, also where nobody waits for it any more.
+            # Once it is on disk it must take effect, even if the caller is cancelled.
             order = self.supply.async_order(value)
             await async_run_uncancelled(self.hass, order, "evse_bus shared supply")
             self.issues.supply_renewed()
 
-    async def _async_share(self, supply: Supply) -> None:
+    async def _async_apply_supply(self, supply: Supply) -> None:
         self._notify(BUS)
-        if self.lines.duty is not None:
-            await self.lines.duty.change_supply(supply)
+        if self.connections.duty is not None:
+            await self.connections.duty.change_supply(supply)
 
     @callback
     def _on_duty(self) -> None:
-        if self.lines.duty is not None:
-            self.issues.check_bus(self.lines.duty.noticed)
+        if self.connections.duty is not None:
+            self.issues.check_bus(self.connections.duty.noticed)
         self._notify(BUS)
 
-    # -- Chargers come, change and go --------------------------------------------
+    # -- Add, change and remove chargers -----------------------------------------
 
-    async def async_match_subentries(self) -> None:
-        """Make the chargers on the bus those of the subentries.
+    async def async_sync_subentries(self) -> None:
+        """Add, change and remove chargers to match the subentries.
 
-        Only what differs is touched: the others keep talking.
+        Chargers whose configuration has not changed are polled without a break.
         """
-        async with self._changing:
+        async with self._lock:
             if self._stopped:
                 return
-            self.lines.rename(self.entry.title)
-            self.lines.follow_options(self.entry.options)
-            self.devices.show_bus()
-            zone = dt_util.get_default_time_zone()
-            wanted = {
+            entry = self.config_entry
+            self.connections.rename(entry.title)
+            self.connections.update_options(entry.options)
+            self.devices.register_bus()
+            time_zone = dt_util.get_default_time_zone()
+            configured = {
                 config.key: (subentry, config)
-                for subentry in self.entry.get_subentries_of_type(SUBENTRY_CHARGER)
-                for config in charger_configs(self.entry.data, subentry, zone)
+                for subentry in entry.get_subentries_of_type(SUBENTRY_CHARGER)
+                for config in charger_configs(entry.data, subentry, time_zone)
             }
-            for key in self.units.keys() - wanted.keys():
-                await self._remove(self.units[key])
-            for key, (subentry, config) in wanted.items():
-                if (unit := self.units.get(key)) is None:
-                    await self._add(subentry, config)
+            for key in self.chargers.keys() - configured.keys():
+                await self._async_remove_charger(self.chargers[key])
+            for key, (subentry, config) in configured.items():
+                if (managed := self.chargers.get(key)) is None:
+                    await self._async_add_charger(subentry, config)
                 else:
-                    await self._change(unit, subentry, config)
-            await self.orders.async_keep_only(wanted)
+                    await self._async_change_charger(managed, subentry, config)
+            await self.orders.async_keep_only(configured)
 
-    async def _add(self, subentry: ConfigSubentry, config: ChargerConfig) -> None:
+    async def _async_add_charger(
+        self, subentry: ConfigSubentry, config: ChargerConfig
+    ) -> None:
         key = config.key
-        charger_orders = self.orders.get(key)
-        # Its device outlives restarts: there is one, so there were orders.
-        lost = charger_orders is None and self.devices.has(key, subentry.subentry_id)
-        orders = charger_orders or first_orders(subentry, config)
-        if charger_orders is None:
+        orders = self.orders.get(key)
+        # The device registry outlives restarts: a known charger must have had orders.
+        lost = orders is None and self.devices.has(key, subentry.subentry_id)
+        if orders is None:
+            orders = initial_orders(subentry, config)
             await self.orders.async_commit(key, orders)
         charger = self.protocol.charger(config, orders)
-        part = config.address if self.protocol.ports > 1 else None
-        bus = await self.lines.join(config, subentry.title)
-        unit = ChargerUnit(subentry, charger, bus, part)
-        self.units[key] = unit
-        self.devices.show_charger(unit)
+        port_number = config.address if self.protocol.ports > 1 else None
+        bus = await self.connections.acquire_bus(config, subentry.title)
+        managed = ManagedCharger(subentry, charger, bus, port_number)
+        self.chargers[key] = managed
+        self.devices.register_charger(managed)
         if lost:
-            self.issues.orders_lost(unit, orders)
-        self._connect(unit)
-        self._add_entities(unit)
+            self.issues.orders_lost(managed, orders)
+        self._put_on_bus(managed)
+        self._add_entities(managed)
         async_set_up_now(self.hass, subentry)
 
-    def _connect(self, unit: ChargerUnit) -> None:
-        charger = unit.charger
-        charger.commit = partial(self._async_commit, unit)
-        stop = [charger.subscribe(partial(self._on_charger, unit))]
-        if self.bus is None:
-            stop.append(unit.bus.subscribe(partial(self._on_line, unit)))
-
-        def unsubscribe() -> None:
-            while stop:
-                stop.pop()()
-
-        unit.unsubscribe = unsubscribe
-        unit.bus.add(charger)
-        if isinstance(charger, EwsPort):
-            stop.append(charger.subscribe_events(unit.events.tell))
-
-    @callback
-    def _on_line(self, unit: ChargerUnit) -> None:
-        """Tell that the line which a box has for itself has come or gone."""
-        self._notify((unit.key, None))
-        if unit.leads:
-            self._notify(BUS)
-
-    async def _async_commit(self, unit: ChargerUnit, orders: Orders) -> None:
-        self.issues.orders_renewed(unit)
-        await self.orders.async_commit(unit.key, orders)
-
-    async def _change(
-        self, unit: ChargerUnit, subentry: ConfigSubentry, config: ChargerConfig
+    async def _async_change_charger(
+        self, managed: ManagedCharger, subentry: ConfigSubentry, config: ChargerConfig
     ) -> None:
-        unit.subentry = subentry
-        old = unit.charger
+        managed.subentry = subentry
+        old = managed.charger
         if config == old.config:
             return
-        LOGGER.debug("%s: its set-up was changed", config.name)
-        # It may have become a box that is being offered.
+        LOGGER.debug("%s: configuration changed", config.name)
+        # Its new serial number may be that of a box that is being offered.
         async_set_up_now(self.hass, subentry)
         if changes_in_place(old.config, config):
             old.set_up(config)
-            self.devices.show_charger(unit)
-            self._on_charger(unit)
-            return
-        unit.unsubscribe()
-        await unit.bus.remove(old)
-        await self.lines.leave(unit.bus)
-        self.issues.forget(unit)
-        unit.charger = self.protocol.charger(config, old.orders)
-        unit.bus = await self.lines.join(config, subentry.title)
-        self.devices.show_charger(unit)
-        self._connect(unit)
-        self._on_charger(unit)
+        else:
+            managed.unsubscribe()
+            await managed.bus.remove(old)
+            await self.connections.release_bus(managed.bus)
+            self.issues.forget(managed)
+            managed.charger = self.protocol.charger(config, old.orders)
+            managed.bus = await self.connections.acquire_bus(config, subentry.title)
+        self.devices.register_charger(managed)
+        if managed.charger is not old:
+            self._put_on_bus(managed)
+        self._on_charger(managed)
 
-    async def _remove(self, unit: ChargerUnit) -> None:
-        unit.unsubscribe()
-        await async_say_farewell([unit.charger], for_good=True)
-        await unit.bus.remove(unit.charger)
-        await self.lines.leave(unit.bus)
-        del self.units[unit.key]
-        self.devices.forget_port(unit)
-        self.issues.forget(unit)
+    async def _async_remove_charger(self, managed: ManagedCharger) -> None:
+        managed.unsubscribe()
+        await async_shut_down_chargers([managed.charger], removed=True)
+        await managed.bus.remove(managed.charger)
+        await self.connections.release_bus(managed.bus)
+        del self.chargers[managed.key]
+        self.devices.remove_port(managed)
+        self.issues.forget(managed)
         self._notify(BUS)
 
-    # -- What a charger tells ----------------------------------------------------
+    def _put_on_bus(self, managed: ManagedCharger) -> None:
+        charger = managed.charger
+        charger.commit = partial(self._async_commit, managed)
+        managed.subscriptions.append(
+            charger.subscribe(partial(self._on_charger, managed))
+        )
+        if self.bus is None:
+            managed.subscriptions.append(
+                managed.bus.subscribe(partial(self._on_own_bus, managed))
+            )
+        managed.bus.add(charger)
+        if isinstance(charger, EwsPort):
+            managed.subscriptions.append(charger.subscribe_events(managed.events.tell))
+
+    async def _async_commit(self, managed: ManagedCharger, orders: Orders) -> None:
+        self.issues.orders_renewed(managed)
+        await self.orders.async_commit(managed.key, orders)
+
+    # -- Updates from the library ------------------------------------------------
 
     @callback
-    def _on_charger(self, unit: ChargerUnit) -> None:
-        charger = unit.charger
+    def _on_own_bus(self, managed: ManagedCharger) -> None:
+        """Handle a box that has connected or disconnected."""
+        self._notify((managed.key, None))
+        if managed.is_primary_port:
+            self._notify(BUS)
+
+    @callback
+    def _on_charger(self, managed: ManagedCharger) -> None:
+        """Handle a changed reading, state or configuration of a charger."""
+        charger = managed.charger
         reading = charger.reading
-        before = unit.connectors
-        unit.connectors = (
+        before = managed.connectors
+        managed.connectors = (
             dict(reading.connectors)
             if reading is not None and charger.available
             else {}
         )
-        self._learn(unit)
-        self.issues.check(unit)
-        self._notify((unit.key, None))
-        for number in before.keys() | unit.connectors.keys():
-            if before.get(number) != unit.connectors.get(number):
-                self._notify((unit.key, number))
+        self._update_structure(managed)
+        self.issues.check(managed)
+        self._notify((managed.key, None))
+        for number in before.keys() | managed.connectors.keys():
+            if before.get(number) != managed.connectors.get(number):
+                self._notify((managed.key, number))
 
-    def _learn(self, unit: ChargerUnit) -> None:
-        """Show what was not known of a charger before."""
-        unit.numbers |= unit.connectors.keys()
-        charger = unit.charger
-        shape = (
+    def _update_structure(self, managed: ManagedCharger) -> None:
+        """Add the devices and entities of what has become known of a charger."""
+        managed.connector_numbers |= managed.connectors.keys()
+        charger = managed.charger
+        structure = (
             charger.capabilities,
             charger.config.order_lifetime is None,
-            frozenset(unit.numbers),
+            frozenset(managed.connector_numbers),
             charger.info,
             frozenset(charger.settings),
         )
-        if shape == unit.shape:
+        if structure == managed.structure:
             return
-        unit.shape = shape
-        self._bind_serial(unit)
-        self.devices.show_charger(unit)
-        self._add_entities(unit)
+        managed.structure = structure
+        self._store_serial(managed)
+        self.devices.register_charger(managed)
+        self._add_entities(managed)
 
-    def _bind_serial(self, unit: ChargerUnit) -> None:
-        """Keep the serial number first found: from now on no other box will do."""
-        info = unit.charger.info
-        subentry = unit.subentry
+    def _store_serial(self, managed: ManagedCharger) -> None:
+        """Store the first serial number read: no other box is accepted from then on."""
+        info = managed.charger.info
+        subentry = managed.subentry
         if info is None or info.serial is None or subentry.data.get(CONF_SERIAL):
             return
         unique_id = charger_unique_id(self.protocol.key, info.serial)
         if any(
             other.unique_id == unique_id
-            for other in self.entry.subentries.values()
+            for other in self.config_entry.subentries.values()
             if other is not subentry
         ):
             return
         self.hass.config_entries.async_update_subentry(
-            self.entry,
+            self.config_entry,
             subentry,
             data={**subentry.data, CONF_SERIAL: info.serial},
             unique_id=unique_id,
         )
 
-    def forget_connector(self, keys: set[str]) -> bool:
-        """Forget a connector by its device's identifiers, if it is gone."""
-        for unit in self.units.values():
-            # The ports of a box are what the set-up says, also while it is off.
-            numbers = () if unit.part is not None else tuple(unit.numbers)
-            for number in numbers:
-                key = connector_key(unit, number)
-                if key in keys and number not in unit.connectors:
-                    unit.numbers.discard(number)
-                    unit.added = {
-                        (platform, unique_id)
-                        for platform, unique_id in unit.added
-                        if not unique_id.startswith(f"{key}_")
-                    }
-                    unit.shape = None
-                    return True
-        # Connectors of an earlier run that have not come back since.
-        return (
-            not any(
-                key in keys
-                for unit in self.units.values()
-                for key in (
-                    unit.subentry_id,
-                    unit.key,
-                    *(connector_key(unit, number) for number in unit.numbers),
-                )
-            )
-            and self.entry.entry_id not in keys
-        )
-
-    # -- Entities ----------------------------------------------------------------
+    # -- Entities and devices ----------------------------------------------------
 
     @callback
-    def async_add_platform(self, adder: Callable[[ChargerUnit], None]) -> None:
-        """Let a platform add entities for each charger, now and as more is learnt."""
-        self._adders.append(adder)
-        for unit in self.units.values():
-            adder(unit)
+    def async_add_platform(
+        self, add_entities: Callable[[ManagedCharger], None]
+    ) -> None:
+        """Register a platform: it is called for each charger, now and as it grows."""
+        self._platforms.append(add_entities)
+        for managed in self.chargers.values():
+            add_entities(managed)
 
-    def _add_entities(self, unit: ChargerUnit) -> None:
-        for adder in self._adders:
-            adder(unit)
+    def _add_entities(self, managed: ManagedCharger) -> None:
+        for add_entities in self._platforms:
+            add_entities(managed)
+
+    def remove_device(self, identifiers: set[str]) -> bool:
+        """Return whether a device may be removed: only that of a missing connector."""
+        in_use = {self.config_entry.entry_id}
+        for managed in self.chargers.values():
+            in_use |= {managed.subentry_id, managed.key}
+            for number in tuple(managed.connector_numbers):
+                key = managed.connector_key(number)
+                # A port is part of the configuration, even while its box is off.
+                is_missing = (
+                    managed.port_number is None and number not in managed.connectors
+                )
+                if is_missing and key in identifiers:
+                    managed.remove_connector(number)
+                else:
+                    in_use.add(key)
+        return not in_use & identifiers
 
     # -- Listeners ---------------------------------------------------------------
 
@@ -370,27 +363,28 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
     def async_add_listener(
         self, update_callback: CALLBACK_TYPE, context: Any = None
     ) -> Callable[[], None]:
-        """Call back when something of this context has changed."""
+        """Listen for updates in a context; without one, of the bus."""
         key: Context = context or BUS
         self._listeners.setdefault(key, []).append(update_callback)
-        if key == STATISTICS and self._stop_statistics is None:
-            self._stop_statistics = async_track_time_interval(
-                self.hass, self._tell_statistics, STATISTICS_INTERVAL
+        if key == STATISTICS and self._unsubscribe_statistics is None:
+            self._unsubscribe_statistics = async_track_time_interval(
+                self.hass, self._notify_statistics, STATISTICS_INTERVAL
             )
         return partial(self._remove_listener, key, update_callback)
 
+    @callback
     def _remove_listener(self, key: Context, update_callback: CALLBACK_TYPE) -> None:
         listeners = self._listeners[key]
         listeners.remove(update_callback)
         if listeners:
             return
         del self._listeners[key]
-        if key == STATISTICS and self._stop_statistics is not None:
-            self._stop_statistics()
-            self._stop_statistics = None
+        if key == STATISTICS and self._unsubscribe_statistics is not None:
+            self._unsubscribe_statistics()
+            self._unsubscribe_statistics = None
 
     @callback
-    def _tell_statistics(self, _now: datetime) -> None:
+    def _notify_statistics(self, _now: datetime) -> None:
         self._notify(STATISTICS)
 
     @callback

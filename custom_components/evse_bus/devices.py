@@ -1,7 +1,9 @@
-"""The devices of a bus: the bus, its chargers behind it, their connectors."""
+"""The devices of a bus: the bus, the chargers connected via it, their connectors."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from homeassistant.config_entries import ConfigEntry
+from homeassistant.core import HomeAssistant
 from homeassistant.helpers import device_registry as dr, entity_registry as er
 from homeassistant.helpers.device_registry import (
     ChildDeviceEntry,
@@ -10,16 +12,11 @@ from homeassistant.helpers.device_registry import (
 )
 
 from .const import DOMAIN, MANUFACTURER
-
-if TYPE_CHECKING:
-    from homeassistant.config_entries import ConfigEntry
-    from homeassistant.core import HomeAssistant
-
-    from .unit import ChargerUnit
+from .managed_charger import ManagedCharger
 
 
 class BusDevices:
-    """The device registry's part of one config entry."""
+    """The devices of one config entry in the device registry."""
 
     def __init__(
         self, hass: HomeAssistant, entry: ConfigEntry, protocol_name: str
@@ -31,8 +28,8 @@ class BusDevices:
         self._registry = dr.async_get(hass)
         self._bus_id = ""
 
-    def show_bus(self) -> None:
-        """Register the bus; chargers can hang on it only when it is there."""
+    def register_bus(self) -> None:
+        """Register the bus; chargers refer to it, so it comes first."""
         device = self._registry.async_get_or_create(
             config_entry_id=self._entry.entry_id,
             identifiers={(DOMAIN, self._entry.entry_id)},
@@ -43,9 +40,9 @@ class BusDevices:
         self._bus_id = device.id
 
     def has(self, key: str, subentry_id: str | None = None) -> bool:
-        """Return whether a charger was set up before, by its key.
+        """Return whether a bus or a charger is registered, by its key.
 
-        The first port of a box is there as long as the box of this subentry.
+        The first port of a box counts as registered with the box of its subentry.
         """
         find = self._registry.async_get_device_by_identifier
         if subentry_id is not None and key in (subentry_id, f"{subentry_id}_1"):
@@ -59,72 +56,75 @@ class BusDevices:
             (DOMAIN, key), self._entry.entry_id
         )
 
-    def show_charger(self, unit: ChargerUnit) -> None:
-        """Register a charger, or what has been learnt of it."""
-        info = unit.charger.info
-        told: dict[str, Any] = {}
+    def register_charger(self, managed: ManagedCharger) -> None:
+        """Register the device of a charger, or update it."""
+        info = managed.charger.info
+        details: dict[str, Any] = {}
         if info is not None:
-            told = {
+            details = {
                 "manufacturer": info.manufacturer,
                 "model": info.model,
                 "sw_version": info.firmware,
                 "hw_version": info.hardware,
             }
-        elif not self.has(unit.subentry_id):
-            # What it told before stands: it may only be switched off.
-            told = {"model": self._protocol_name}
+        elif not self.has(managed.subentry_id):
+            # Otherwise the details read in an earlier run stay: it may be off.
+            details = {"model": self._protocol_name}
         device = self._registry.async_get_or_create(
             config_entry_id=self._entry.entry_id,
-            config_subentry_id=unit.subentry_id,
-            identifiers={(DOMAIN, unit.subentry_id)},
-            name=unit.subentry.title,
+            config_subentry_id=managed.subentry_id,
+            identifiers={(DOMAIN, managed.subentry_id)},
+            name=managed.subentry.title,
             via_device_id=self._bus_id,
-            serial_number=(info and info.serial) or unit.charger.config.serial,
-            **told,
+            serial_number=(info and info.serial) or managed.charger.config.serial,
+            **details,
         )
-        unit.device_id = device.id
-        number = unit.part or 1
-        was_split = self._child(connector_key(unit, number)) is not None
-        if not unit.split and (unit.parts > 1 or len(unit.numbers) > 1 or was_split):
-            unit.split = True
-            self._move_connector(unit, number)
+        managed.device_id = device.id
+        if managed.has_child_devices:
+            return
+        number = managed.port_number or 1
+        if (
+            managed.port_count > 1
+            or len(managed.connector_numbers) > 1
+            or self._child(managed.connector_key(number)) is not None
+        ):
+            managed.has_child_devices = True
+            self._move_to_child_device(managed, number)
 
-    def _move_connector(self, unit: ChargerUnit, number: int) -> None:
-        """Give a connector a device of its own, now that there are more."""
+    def _move_to_child_device(self, managed: ManagedCharger, number: int) -> None:
+        """Move the entities of a connector from the box to a device of its own."""
         child = self._registry.async_get_or_create_child(
             config_entry_id=self._entry.entry_id,
-            config_subentry_id=unit.subentry_id,
-            **connector_info(unit, number),
+            config_subentry_id=managed.subentry_id,
+            **connector_info(managed, number),
         )
         entities = er.async_get(self._hass)
-        prefix = f"{connector_key(unit, number)}_"
+        prefix = f"{managed.connector_key(number)}_"
         for entity in er.async_entries_for_device(
-            entities, unit.device_id, include_disabled_entities=True
+            entities, managed.device_id, include_disabled_entities=True
         ):
             if entity.unique_id.startswith(prefix):
                 entities.async_update_entity(entity.entity_id, device_id=child.id)
 
-    def forget_port(self, unit: ChargerUnit) -> None:
-        """Delete the device of a port that is no longer used, and its entities."""
-        if unit.part is not None and (child := self._child(unit.key)) is not None:
+    def remove_port(self, managed: ManagedCharger) -> None:
+        """Remove the device of a port that is no longer used, with its entities."""
+        if (
+            managed.port_number is not None
+            and (child := self._child(managed.key)) is not None
+        ):
             self._registry.async_remove_device(child.id)
 
 
-def connector_key(unit: ChargerUnit, number: int) -> str:
-    """Return what a connector's identifiers and unique ids begin with."""
-    return f"{unit.subentry_id}_{number}"
+def charger_info(managed: ManagedCharger) -> DeviceInfo:
+    """Return the device info that links an entity to its charger."""
+    return DeviceInfo(identifiers={(DOMAIN, managed.subentry_id)})
 
 
-def charger_info(unit: ChargerUnit) -> DeviceInfo:
-    """Return what links an entity to its charger's device."""
-    return DeviceInfo(identifiers={(DOMAIN, unit.subentry_id)})
-
-
-def connector_info(unit: ChargerUnit, number: int) -> ChildDeviceInfo:
-    """Return a connector's device, as a part of its charger's."""
+def connector_info(managed: ManagedCharger, number: int) -> ChildDeviceInfo:
+    """Return the device info of a connector or port, a child of its box."""
     return ChildDeviceInfo(
-        identifiers={(DOMAIN, connector_key(unit, number))},
-        parent_device_id=unit.device_id,
-        translation_key="connector" if unit.part is None else "port",
+        identifiers={(DOMAIN, managed.connector_key(number))},
+        parent_device_id=managed.device_id,
+        translation_key="connector" if managed.port_number is None else "port",
         translation_placeholders={"number": str(number)},
     )

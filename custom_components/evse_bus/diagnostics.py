@@ -1,4 +1,4 @@
-"""Diagnostics: all that helps to find a fault, without what identifies a house."""
+"""Diagnostics of a bus and its chargers, without data that identifies a house."""
 
 from collections.abc import Mapping, Sequence, Set as AbstractSet
 from dataclasses import fields, is_dataclass
@@ -11,17 +11,17 @@ from homeassistant.const import CONF_ADDRESS, CONF_DEVICE, CONF_HOST
 from homeassistant.core import HomeAssistant
 from homeassistant.helpers.device_registry import ChildDeviceEntry, DeviceEntry
 
-from .connections import ListenerLines
+from .connections import ListenerConnections
 from .const import CONF_SERIAL, DOMAIN
 from .coordinator import BusCoordinator, EvseBusConfigEntry
 from .evse.bus import Bus
 from .evse.smartevse import Master
 from .evse.statistics import Direction
+from .managed_charger import ManagedCharger
 from .redaction import on_wire, without_serial
-from .unit import ChargerUnit
 
-# An adapter's path and a network address name the house as a serial number does.
-# An EVBox is addressed by its serial number.
+# The path of an adapter and a network address identify a house, as a serial number
+# does. An EVBox is addressed by its serial number.
 _PRIVATE: Final = {
     CONF_DEVICE,
     CONF_HOST,
@@ -37,37 +37,66 @@ async def async_get_config_entry_diagnostics(
     hass: HomeAssistant,  # noqa: ARG001 - Home Assistant's signature
     entry: EvseBusConfigEntry,
 ) -> dict[str, Any]:
-    """Return a bus, its last frames and its chargers."""
-    set_up = async_redact_data(dict(entry.data), _PRIVATE)
-    if not _was_set_up(entry):
-        return {"set_up": set_up}
+    """Return diagnostics for a config entry: its bus or buses and all chargers."""
+    configuration = async_redact_data(dict(entry.data), _PRIVATE)
+    if not _has_run(entry):
+        return {"set_up": configuration}
     coordinator = entry.runtime_data
-    units = coordinator.units.values()
+    chargers = list(coordinator.chargers.values())
     data = {
-        "set_up": set_up,
+        "set_up": configuration,
         "master": _master(coordinator),
-        "chargers": [_charger(coordinator, unit) for unit in units],
+        "chargers": [_charger(coordinator, managed) for managed in chargers],
     }
-    if isinstance(lines := coordinator.lines, ListenerLines):
-        return data | {
-            "listener": {
-                "networks_allowed": len(lines.listener.allowed),
-                **plain(lines.listener.statistics),
-            },
-            "boxes": [
-                _bus(coordinator, unit.bus, [unit]) for unit in units if unit.leads
-            ],
+    if isinstance(connections := coordinator.connections, ListenerConnections):
+        listener = connections.listener
+        data["listener"] = {
+            "networks_allowed": len(listener.allowed),
+            **plain(listener.statistics),
         }
-    return data | _bus(coordinator, lines.only, list(units)) if lines.only else data
+        data["boxes"] = [
+            _bus(coordinator, managed.bus, [managed])
+            for managed in chargers
+            if managed.is_primary_port
+        ]
+    elif coordinator.bus is not None:
+        data |= _bus(coordinator, coordinator.bus, chargers)
+    return data
 
 
-def _was_set_up(entry: EvseBusConfigEntry) -> bool:
-    """Return whether there is more to tell: not of one that is disabled or ignored."""
+async def async_get_device_diagnostics(
+    hass: HomeAssistant,
+    entry: EvseBusConfigEntry,
+    device: DeviceEntry | ChildDeviceEntry,
+) -> dict[str, Any]:
+    """Return diagnostics for a charger and its bus; for the bus device: for all."""
+    if not _has_run(entry):
+        return await async_get_config_entry_diagnostics(hass, entry)
+    coordinator = entry.runtime_data
+    keys = {key for domain, key in device.identifiers if domain == DOMAIN}
+    chargers = tuple(coordinator.chargers.values())
+    selected = [managed for managed in chargers if managed.key in keys] or [
+        managed
+        for managed in chargers
+        if managed.subentry_id == device.config_subentry_id
+        or managed.subentry_id in keys
+    ]
+    if not selected:
+        return await async_get_config_entry_diagnostics(hass, entry)
+    data = [_charger(coordinator, managed) for managed in selected]
+    return {
+        **({"charger": data[0]} if len(data) == 1 else {"chargers": data}),
+        "frames": _frames(coordinator, selected[0].bus, chargers),
+    }
+
+
+def _has_run(entry: EvseBusConfigEntry) -> bool:
+    """Return whether a coordinator exists: not for a disabled or ignored entry."""
     return hasattr(entry, "runtime_data")
 
 
 def _bus(
-    coordinator: BusCoordinator, bus: Bus, units: Sequence[ChargerUnit]
+    coordinator: BusCoordinator, bus: Bus, chargers: Sequence[ManagedCharger]
 ) -> dict[str, Any]:
     """Return a line, the bus on it, and its last frames."""
     return {
@@ -81,58 +110,34 @@ def _bus(
             "utilisation": bus.wire.statistics.utilisation(bus.now),
             **plain(bus.wire.statistics),
         },
-        "frames": _frames(coordinator, bus, units),
-    }
-
-
-async def async_get_device_diagnostics(
-    hass: HomeAssistant,
-    entry: EvseBusConfigEntry,
-    device: DeviceEntry | ChildDeviceEntry,
-) -> dict[str, Any]:
-    """Return one charger and the bus's last frames; for the bus: all."""
-    if not _was_set_up(entry):
-        return await async_get_config_entry_diagnostics(hass, entry)
-    coordinator = entry.runtime_data
-    keys = {key for domain, key in device.identifiers if domain == DOMAIN}
-    units = tuple(coordinator.units.values())
-    mine = [unit for unit in units if unit.key in keys] or [
-        unit
-        for unit in units
-        if unit.subentry_id == device.config_subentry_id or unit.subentry_id in keys
-    ]
-    if not mine:
-        return await async_get_config_entry_diagnostics(hass, entry)
-    told = [_charger(coordinator, unit) for unit in mine]
-    return {
-        **({"charger": told[0]} if len(told) == 1 else {"chargers": told}),
-        "frames": _frames(coordinator, mine[0].bus, units),
+        "frames": _frames(coordinator, bus, chargers),
     }
 
 
 def _master(coordinator: BusCoordinator) -> dict[str, Any] | None:
-    """Return what the master of a bus does; ``None``: the bus has none."""
-    duty = coordinator.lines.duty
+    """Return the state of the bus master; ``None``: the protocol has none."""
+    duty = coordinator.connections.duty
     if duty is None:
         return None
-    order = coordinator.orders.supply
     data = {
         "silent": duty.silent,
         "noticed": plain(duty.noticed),
-        "order": plain(order),
+        "order": plain(coordinator.orders.supply),
         "statistics": plain(duty.statistics),
     }
     if isinstance(duty, Master):
-        shares = duty.shares()
         data["supply"] = plain(duty.supply)
-        data["shares"] = {str(unit): share / 10 for unit, share in shares.items()}
+        # In tenths of an ampere, by Modbus address.
+        data["shares"] = {
+            str(address): share / 10 for address, share in duty.shares().items()
+        }
     return data
 
 
-def _charger(coordinator: BusCoordinator, unit: ChargerUnit) -> dict[str, Any]:
-    charger = unit.charger
+def _charger(coordinator: BusCoordinator, managed: ManagedCharger) -> dict[str, Any]:
+    charger = managed.charger
     config: dict[str, Any] = plain(charger.config)
-    # What the user calls it may be a person or a place.
+    # The name given by the user may be that of a person or a place.
     config |= {"key": REDACTED, "name": REDACTED}
     if coordinator.protocol.key in _PRIVATE_ADDRESS:
         config[CONF_ADDRESS] = REDACTED
@@ -155,13 +160,16 @@ def _charger(coordinator: BusCoordinator, unit: ChargerUnit) -> dict[str, Any]:
 
 
 def _frames(
-    coordinator: BusCoordinator, bus: Bus, units: Sequence[ChargerUnit]
+    coordinator: BusCoordinator, bus: Bus, chargers: Sequence[ManagedCharger]
 ) -> list[dict[str, str]]:
+    """Return the last frames of a bus, with the serial numbers hidden."""
     protocol = coordinator.protocol.key
-    chargers = [unit.charger for unit in units]
-    told = {one.config.serial for one in chargers}
-    told |= {one.info.serial for one in chargers if one.info is not None}
-    serials = on_wire(protocol, told)
+    known: set[str | None] = set()
+    for managed in chargers:
+        known.add(managed.charger.config.serial)
+        if managed.charger.info is not None:
+            known.add(managed.charger.info.serial)
+    serials = on_wire(protocol, known)
     return [
         {
             "time": datetime.fromtimestamp(frame.when, UTC).isoformat(),
@@ -178,7 +186,7 @@ def _frames(
 
 
 def plain(value: object) -> Any:  # noqa: ANN401 - JSON has no better type
-    """Return a value of the library as JSON can say it."""
+    """Return a value of the library as JSON data: a dataclass as a dict, and so on."""
     result: Any = value
     if is_dataclass(value):
         result = {

@@ -1,62 +1,53 @@
-"""What all entities share: whose they are, and when they speak.
+"""Base classes of the entities: their devices, and when they write their state.
 
-An entity writes its state only when what it shows has changed: a busy bus tells
-much, and most of it is what was told before.
+An entity writes its state only when a value it shows has changed: most updates from a
+busy bus repeat the previous values.
 """
 
 from abc import abstractmethod
 from collections.abc import Callable, Hashable, Iterable
-from typing import TYPE_CHECKING, Final, Protocol, override
+from typing import Final, Protocol, override
 
 from homeassistant.config_entries import ConfigEntryState
 from homeassistant.core import callback
 from homeassistant.helpers import entity_registry as er
 from homeassistant.helpers.device_registry import DeviceInfo
+from homeassistant.helpers.entity import Entity, EntityDescription
+from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
 from homeassistant.helpers.update_coordinator import BaseCoordinatorEntity
 
 from .const import DOMAIN
-from .coordinator import (
-    BUS,
-    BusCoordinator,
-    Context,
-    EvseBusConfigEntry,
-)
-from .devices import charger_info, connector_info, connector_key
-from .unit import ChargerUnit
+from .coordinator import BUS, BusCoordinator, Context, EvseBusConfigEntry
+from .devices import charger_info, connector_info
+from .evse.charger import Charger
+from .evse.model import Capability, Range, Setting
+from .evse.readings import ConnectorReading
+from .managed_charger import ManagedCharger
 
-if TYPE_CHECKING:
-    from homeassistant.helpers.entity import Entity, EntityDescription
-    from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
-
-    from .evse.charger import Charger
-    from .evse.model import Capability, Range, Setting
-    from .evse.readings import ConnectorReading
-
-
-_GROWING: Final = (ConfigEntryState.SETUP_IN_PROGRESS, ConfigEntryState.LOADED)
+_ADDING_STATES: Final = (ConfigEntryState.SETUP_IN_PROGRESS, ConfigEntryState.LOADED)
 
 
 class CapabilityDescription(Protocol):
-    """A description of something that not every charger has."""
+    """A description of an entity that only some chargers have."""
 
     @property
     def capability(self) -> Capability | None:
-        """Return what a charger must have; ``None``: every one has it."""
+        """Return the capability a charger must have; ``None``: all chargers have it."""
 
 
 def supported[D: CapabilityDescription](
-    unit: ChargerUnit, descriptions: Iterable[D]
+    managed: ManagedCharger, descriptions: Iterable[D]
 ) -> Iterable[D]:
-    """Return what a charger has of a table.
+    """Return the descriptions from a table that apply to a charger.
 
-    What is of a whole box (``whole``) is there once, however many ports it has.
+    A description of a whole box (``whole``) applies to its primary port only.
     """
-    capabilities = unit.charger.capabilities
+    capabilities = managed.charger.capabilities
     return (
         description
         for description in descriptions
         if (description.capability is None or description.capability in capabilities)
-        and (unit.leads or not getattr(description, "whole", False))
+        and (managed.is_primary_port or not getattr(description, "whole", False))
     )
 
 
@@ -65,36 +56,38 @@ def add_charger_entities(
     domain: str,
     entry: EvseBusConfigEntry,
     async_add_entities: AddConfigEntryEntitiesCallback,
-    make: Callable[[BusCoordinator, ChargerUnit], Iterable[Entity]],
-    unwanted: Callable[[ChargerUnit], Iterable[str]] = lambda _unit: (),
+    make: Callable[[BusCoordinator, ManagedCharger], Iterable[Entity]],
+    obsolete: Callable[[ManagedCharger], Iterable[str]] = lambda _managed: (),
 ) -> None:
-    """Add a platform's entities for each charger, now and as more is learnt.
+    """Add the entities of a platform for each charger, now and as it grows.
 
-    ``unwanted`` returns keys of those that a charger's set-up leaves no use for;
-    where they exist, they are removed.
+    ``obsolete`` returns the keys of entities that a charger's configuration rules
+    out; existing ones are removed from the registry.
     """
     coordinator = entry.runtime_data
     registry = er.async_get(coordinator.hass)
 
     @callback
-    def add(unit: ChargerUnit) -> None:
-        if entry.state not in _GROWING:
-            # The bus still talks while the platforms are being unloaded.
+    def add(managed: ManagedCharger) -> None:
+        if entry.state not in _ADDING_STATES:
+            # The bus still polls while the platforms are being unloaded.
             return
-        for key in unwanted(unit):
-            unique_id = f"{unit.key}_{key}"
-            unit.added.discard((domain, unique_id))
+        for key in obsolete(managed):
+            unique_id = f"{managed.key}_{key}"
+            managed.added_entities.discard((domain, unique_id))
             if known := registry.async_get_entity_id(domain, DOMAIN, unique_id):
                 registry.async_remove(known)
         new = [
             entity
-            for entity in make(coordinator, unit)
-            if (domain, entity.unique_id) not in unit.added
+            for entity in make(coordinator, managed)
+            if (domain, entity.unique_id) not in managed.added_entities
         ]
         if not new:
             return
-        unit.added.update((domain, entity.unique_id or "") for entity in new)
-        async_add_entities(new, config_subentry_id=unit.subentry_id)
+        managed.added_entities.update(
+            (domain, entity.unique_id or "") for entity in new
+        )
+        async_add_entities(new, config_subentry_id=managed.subentry_id)
 
     coordinator.async_add_platform(add)
 
@@ -110,45 +103,45 @@ class EvseBusEntity(BaseCoordinatorEntity[BusCoordinator]):
         context: Context,
         description: EntityDescription,
     ) -> None:
-        """Listen in a context."""
+        """Initialize the entity, which listens in this context."""
         super().__init__(coordinator, context)
         self.entity_description = description
-        self._seen: Hashable = None
+        self._last_shown: Hashable = None
 
     @override
     async def async_added_to_hass(self) -> None:
-        """Listen, and show what is known already."""
+        """Start listening, and show the current values."""
         await super().async_added_to_hass()
-        self._look()
+        self._update()
 
     @callback
     @override
     def _handle_coordinator_update(self) -> None:
-        """Show what has changed."""
-        if self._look():
+        """Write the state if anything shown has changed."""
+        if self._update():
             self.async_write_ha_state()
 
-    def _look(self) -> bool:
-        """Take over what is known now; return whether it differs from before."""
+    def _update(self) -> bool:
+        """Update the attributes; return whether any of them has changed."""
         available = self.is_available()
-        seen = (available, self.show() if available else None)
-        if seen == self._seen:
+        shown = (available, self.update_attributes() if available else None)
+        if shown == self._last_shown:
             return False
-        self._seen = seen
+        self._last_shown = shown
         self._attr_available = available
         return True
 
     @abstractmethod
     def is_available(self) -> bool:
-        """Return whether there is anything to show."""
+        """Return whether the entity has values to show."""
 
     @abstractmethod
-    def show(self) -> Hashable:
-        """Set the entity's attributes from what is known; return what they are."""
+    def update_attributes(self) -> Hashable:
+        """Set the entity's attributes; return their values, to detect changes."""
 
     @override
     async def async_update(self) -> None:
-        """Do nothing: the bus decides when a charger is asked."""
+        """Do nothing: the bus schedules its polls itself."""
 
 
 class BusEntity(EvseBusEntity):
@@ -160,15 +153,15 @@ class BusEntity(EvseBusEntity):
         description: EntityDescription,
         context: Context = BUS,
     ) -> None:
-        """Belong to the bus's device."""
+        """Attach the entity to the device of the bus."""
         super().__init__(coordinator, context, description)
-        entry_id = coordinator.entry.entry_id
+        entry_id = coordinator.config_entry.entry_id
         self._attr_unique_id = f"{entry_id}_{description.key}"
         self._attr_device_info = DeviceInfo(identifiers={(DOMAIN, entry_id)})
 
     @override
     def is_available(self) -> bool:
-        """Return true: a bus that is down can still say so."""
+        """Return true: the state of a bus is known even while its port is closed."""
         return True
 
 
@@ -178,27 +171,29 @@ class ChargerEntity(EvseBusEntity):
     def __init__(
         self,
         coordinator: BusCoordinator,
-        unit: ChargerUnit,
+        managed: ManagedCharger,
         description: EntityDescription,
         context: Context | None = None,
         *,
         whole: bool = False,
     ) -> None:
-        """Belong to the charger's device; ``whole``: to that of its whole box."""
-        super().__init__(coordinator, context or (unit.key, None), description)
-        self.unit = unit
-        owner = unit.subentry_id if whole else unit.key
+        """Attach the entity to the charger's device; ``whole``: to that of its box."""
+        super().__init__(coordinator, context or (managed.key, None), description)
+        self.managed = managed
+        owner = managed.subentry_id if whole else managed.key
         self._attr_unique_id = f"{owner}_{description.key}"
         self._attr_device_info = (
-            connector_info(unit, unit.part)
-            if unit.part is not None and unit.split and not whole
-            else charger_info(unit)
+            connector_info(managed, managed.port_number)
+            if managed.port_number is not None
+            and managed.has_child_devices
+            and not whole
+            else charger_info(managed)
         )
 
     @property
     def charger(self) -> Charger:
-        """Return the library's charger; another one after a changed set-up."""
-        return self.unit.charger
+        """Return the charger of the library; a changed configuration may replace it."""
+        return self.managed.charger
 
     @override
     def is_available(self) -> bool:
@@ -207,33 +202,33 @@ class ChargerEntity(EvseBusEntity):
 
 
 class SettingEntity(ChargerEntity):
-    """Something that a box keeps in its own memory."""
+    """A setting that a box stores in its own memory."""
 
     def __init__(
         self,
         coordinator: BusCoordinator,
-        unit: ChargerUnit,
+        managed: ManagedCharger,
         description: EntityDescription,
         setting: Setting,
     ) -> None:
-        """Belong to the charger's device."""
-        super().__init__(coordinator, unit, description)
+        """Attach the entity to the charger's device."""
+        super().__init__(coordinator, managed, description)
         self.setting = setting
 
     @property
-    def told(self) -> int | None:
-        """Return what the box told; ``None``: it was not read."""
+    def stored_value(self) -> int | None:
+        """Return the value read from the box; ``None``: not read yet."""
         reading = self.charger.reading
         return None if reading is None else reading.settings.get(self.setting)
 
     @property
-    def reach(self) -> Range:
-        """Return from where to where it can be set."""
+    def value_range(self) -> Range:
+        """Return the range in which it can be set."""
         return self.charger.settings[self.setting]
 
     @override
     def is_available(self) -> bool:
-        """Return whether the charger answers and has this setting still."""
+        """Return whether the charger answers and still has this setting."""
         return super().is_available() and self.setting in self.charger.settings
 
 
@@ -243,21 +238,23 @@ class ConnectorEntity(ChargerEntity):
     def __init__(
         self,
         coordinator: BusCoordinator,
-        unit: ChargerUnit,
+        managed: ManagedCharger,
         number: int,
         description: EntityDescription,
     ) -> None:
-        """Belong to the connector's device, or to its charger's if it is the only."""
-        super().__init__(coordinator, unit, description, context=(unit.key, number))
+        """Attach the entity to the connector's device; a single one has none."""
+        super().__init__(
+            coordinator, managed, description, context=(managed.key, number)
+        )
         self.number = number
-        self._attr_unique_id = f"{connector_key(unit, number)}_{description.key}"
-        if unit.split:
-            self._attr_device_info = connector_info(unit, number)
+        self._attr_unique_id = f"{managed.connector_key(number)}_{description.key}"
+        if managed.has_child_devices:
+            self._attr_device_info = connector_info(managed, number)
 
     @property
     def reading(self) -> ConnectorReading | None:
-        """Return what the charger said of this connector last."""
-        return self.unit.connector(self.number)
+        """Return the connector's last reading; ``None``: not available."""
+        return self.managed.connector(self.number)
 
     @override
     def is_available(self) -> bool:

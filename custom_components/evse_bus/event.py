@@ -25,7 +25,7 @@ from .evse.ews.events import (
 )
 from .evse.ews.info import KEYS, KeyEvent
 from .evse.model import Capability
-from .unit import ChargerUnit
+from .managed_charger import ManagedCharger
 
 PARALLEL_UPDATES = 0
 
@@ -130,9 +130,11 @@ async def async_setup_entry(
     add_charger_entities(Platform.EVENT, entry, async_add_entities, _events)
 
 
-def _events(coordinator: BusCoordinator, unit: ChargerUnit) -> Iterable[EventEntity]:
-    for description in supported(unit, EVENTS):
-        yield ChargerEvent(coordinator, unit, description)
+def _events(
+    coordinator: BusCoordinator, managed: ManagedCharger
+) -> Iterable[EventEntity]:
+    for description in supported(managed, EVENTS):
+        yield ChargerEvent(coordinator, managed, description)
 
 
 class ChargerEvent(ChargerEntity, EventEntity):
@@ -141,18 +143,18 @@ class ChargerEvent(ChargerEntity, EventEntity):
     def __init__(
         self,
         coordinator: BusCoordinator,
-        unit: ChargerUnit,
+        managed: ManagedCharger,
         description: ChargerEventDescription,
     ) -> None:
         """Belong to the port, or to the whole box."""
-        super().__init__(coordinator, unit, description, whole=description.whole)
+        super().__init__(coordinator, managed, description, whole=description.whole)
         self._take = description.take
 
     @override
     async def async_added_to_hass(self) -> None:
         """Listen."""
         await super().async_added_to_hass()
-        self.async_on_remove(self.unit.events.subscribe(self._on_event))
+        self.async_on_remove(self.managed.events.subscribe(self._on_event))
 
     @callback
     def _on_event(self, event: Event) -> None:
@@ -164,5 +166,5 @@ class ChargerEvent(ChargerEntity, EventEntity):
         self.async_write_ha_state()
 
     @override
-    def show(self) -> None:
+    def update_attributes(self) -> None:
         """Show nothing but that it is there: an event is told when it happens."""

@@ -1,20 +1,16 @@
-"""Repair issues: what only a person can put right; gone when it is."""
+"""Repair issues: problems that only the user can fix; deleted once they are."""
 
-from typing import TYPE_CHECKING, Final
+from collections.abc import Set as AbstractSet
+from typing import Final
 
+from homeassistant.config_entries import ConfigEntry
+from homeassistant.core import HomeAssistant
 from homeassistant.helpers import issue_registry as ir
 
 from .const import DOMAIN
 from .evse.model import Fault, Orders
 from .evse.safety import INTERVALS_PER_TIMEOUT
-
-if TYPE_CHECKING:
-    from collections.abc import Set as AbstractSet
-
-    from homeassistant.config_entries import ConfigEntry
-    from homeassistant.core import HomeAssistant
-
-    from .unit import ChargerUnit
+from .managed_charger import ManagedCharger
 
 NOT_STORED: Final = "orders_not_stored"
 LOST: Final = "orders_lost"
@@ -31,16 +27,16 @@ UNSUPPORTED_FIRMWARE: Final = "unsupported_firmware"
 
 
 class BusIssues:
-    """The issues of one config entry."""
+    """The repair issues of one config entry."""
 
     def __init__(self, hass: HomeAssistant, entry: ConfigEntry) -> None:
-        """Start with none."""
+        """Start without issues."""
         self._hass = hass
         self._entry = entry
         self._open: dict[str, dict[str, str]] = {}
 
     def orders_written(self, error: Exception | None) -> None:
-        """Note how writing the orders went."""
+        """Report whether the orders could be written; ``None``: they were."""
         self._set(
             NOT_STORED,
             self._entry.entry_id,
@@ -48,24 +44,24 @@ class BusIssues:
             placeholders={"bus": self._entry.title, "error": str(error)},
         )
 
-    def orders_lost(self, unit: ChargerUnit, orders: Orders) -> None:
-        """Note that a charger's stored orders were not there."""
+    def orders_lost(self, managed: ManagedCharger, orders: Orders) -> None:
+        """Report that a charger's stored orders are missing."""
         self._set(
             LOST,
-            unit.key,
+            managed.key,
             present=True,
             placeholders={
-                "charger": unit.name,
+                "charger": managed.name,
                 "current": f"{orders.limit.current:g}",
             },
         )
 
-    def orders_renewed(self, unit: ChargerUnit) -> None:
-        """Note that somebody has given a charger orders again."""
-        self._set(LOST, unit.key, present=False)
+    def orders_renewed(self, managed: ManagedCharger) -> None:
+        """Clear the report of missing orders: the charger has new ones."""
+        self._set(LOST, managed.key, present=False)
 
     def supply_lost(self, current: float) -> None:
-        """Note that the stored order about a bus's supply was not there."""
+        """Report that the stored limit of the shared supply is missing."""
         self._set(
             SUPPLY_LOST,
             self._entry.entry_id,
@@ -74,11 +70,11 @@ class BusIssues:
         )
 
     def supply_renewed(self) -> None:
-        """Note that somebody has said again what a bus shares."""
+        """Clear the report of a missing supply limit: it was set again."""
         self._set(SUPPLY_LOST, self._entry.entry_id, present=False)
 
     def check_bus(self, noticed: AbstractSet[Fault]) -> None:
-        """Note what was noticed of the whole bus."""
+        """Report or clear faults of the whole bus."""
         self._set(
             SECOND_MASTER,
             self._entry.entry_id,
@@ -86,81 +82,82 @@ class BusIssues:
             placeholders={"bus": self._entry.title},
         )
 
-    def check(self, unit: ChargerUnit) -> None:
-        """Note what a charger told, or what was noticed of it."""
-        charger = unit.charger
+    def check(self, managed: ManagedCharger) -> None:
+        """Report or clear the faults of a charger."""
+        charger = managed.charger
         config = charger.config
-        twice = Fault.DUPLICATE_ADDRESS in charger.faults
-        noticed = {
-            # Of a box with several ports, once.
-            WRONG_CHARGER: Fault.WRONG_CHARGER in charger.faults and unit.leads,
+        is_duplicate = Fault.DUPLICATE_ADDRESS in charger.faults
+        faults = {
+            # Once for a box with several ports.
+            WRONG_CHARGER: Fault.WRONG_CHARGER in charger.faults
+            and managed.is_primary_port,
             NO_SUCH_PORT: Fault.NO_SUCH_PORT in charger.faults,
-            DUPLICATE_ADDRESS: twice and not charger.shares_address,
-            SHARED_ADDRESS: twice and charger.shares_address,
+            DUPLICATE_ADDRESS: is_duplicate and not charger.shares_address,
+            SHARED_ADDRESS: is_duplicate and charger.shares_address,
         }
-        for key, present in noticed.items():
+        for key, present in faults.items():
             self._set(
                 key,
-                unit.key,
+                managed.key,
                 present=present,
                 placeholders={
-                    "charger": unit.name,
+                    "charger": managed.name,
                     "address": str(config.address),
                     "expected": config.serial or "-",
                 },
             )
-        self._check_firmware(unit)
-        self._check_timeout(unit)
+        self._check_firmware(managed)
+        self._check_timeout(managed)
 
-    def _check_firmware(self, unit: ChargerUnit) -> None:
-        """Note a firmware that is not known, or that this bus cannot use."""
-        charger = unit.charger
+    def _check_firmware(self, managed: ManagedCharger) -> None:
+        """Report a firmware that is unknown, or that this protocol does not support."""
+        charger = managed.charger
         present = Fault.UNSUPPORTED_FIRMWARE in charger.faults
         firmware = charger.info.firmware if charger.info is not None else None
         for key in (UNKNOWN_FIRMWARE, UNSUPPORTED_FIRMWARE):
             self._set(
                 key,
-                unit.key,
+                managed.key,
                 present=present and (key == UNKNOWN_FIRMWARE) == (firmware is None),
                 placeholders={
-                    "charger": unit.name,
+                    "charger": managed.name,
                     "address": str(charger.config.address),
                     "firmware": firmware or "-",
                 },
             )
 
-    def _check_timeout(self, unit: ChargerUnit) -> None:
-        """Note a fail-safe time-out that is longer than ordered."""
-        charger = unit.charger
+    def _check_timeout(self, managed: ManagedCharger) -> None:
+        """Report a fail-safe time-out in use that is longer than the one ordered."""
+        charger = managed.charger
         reading = charger.reading
-        told = reading.minimum_interval if reading else None
-        # The interval that counts before one is told is a guess: no news.
-        if told is None:
+        interval = reading.minimum_interval if reading else None
+        # Until the charger reports its interval, the one in use is an assumption.
+        if interval is None:
             return
         ordered = charger.effective_orders.fail_safe_timeout
-        if ordered >= INTERVALS_PER_TIMEOUT * told:
-            self._set(TIMEOUT_RAISED, unit.key, present=False)
+        if ordered >= INTERVALS_PER_TIMEOUT * interval:
+            self._set(TIMEOUT_RAISED, managed.key, present=False)
             return
         used = charger.setpoint.fail_safe_timeout
         self._set(
             TIMEOUT_RAISED,
-            unit.key,
+            managed.key,
             present=used > ordered,
             placeholders={
-                "charger": unit.name,
-                "interval": f"{told:g}",
+                "charger": managed.name,
+                "interval": f"{interval:g}",
                 "ordered": str(ordered),
                 "used": str(used),
             },
         )
 
-    def forget(self, unit: ChargerUnit) -> None:
-        """Delete the issues of a charger that is no more."""
-        for issue in [one for one in self._open if one.endswith(unit.key)]:
+    def forget(self, managed: ManagedCharger) -> None:
+        """Delete the issues of a charger."""
+        for issue in [one for one in self._open if one.endswith(managed.key)]:
             self._delete(issue)
 
     def clear(self) -> None:
-        """Delete all issues of this bus."""
+        """Delete all issues of this entry."""
         for issue in tuple(self._open):
             self._delete(issue)
 

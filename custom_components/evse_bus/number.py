@@ -40,8 +40,8 @@ from .evse.model import (
     Setting,
 )
 from .evse.safety import number
+from .managed_charger import ManagedCharger
 from .supply import STEP, SharedSupply
-from .unit import ChargerUnit
 
 PARALLEL_UPDATES = 0
 
@@ -260,20 +260,22 @@ async def async_setup_entry(
     if (supply := entry.runtime_data.supply) is not None:
         async_add_entities([SupplyNumber(entry.runtime_data, supply)])
     add_charger_entities(
-        Platform.NUMBER, entry, async_add_entities, _numbers, _unwanted
+        Platform.NUMBER, entry, async_add_entities, _numbers, _obsolete
     )
 
 
-def _numbers(coordinator: BusCoordinator, unit: ChargerUnit) -> Iterable[NumberEntity]:
-    order = partial(OrderNumber, coordinator, unit)
-    yield from (order(entry) for entry in NUMBERS if entry.exists(unit.charger))
-    setting = partial(SettingNumber, coordinator, unit)
-    there = unit.charger.settings
+def _numbers(
+    coordinator: BusCoordinator, managed: ManagedCharger
+) -> Iterable[NumberEntity]:
+    order = partial(OrderNumber, coordinator, managed)
+    yield from (order(entry) for entry in NUMBERS if entry.exists(managed.charger))
+    setting = partial(SettingNumber, coordinator, managed)
+    there = managed.charger.settings
     yield from (setting(entry) for entry in SETTINGS if entry.setting in there)
 
 
-def _unwanted(unit: ChargerUnit) -> Iterable[str]:
-    return () if falls_back(unit.charger) else (FAIL_SAFE_CURRENT,)
+def _obsolete(managed: ManagedCharger) -> Iterable[str]:
+    return () if falls_back(managed.charger) else (FAIL_SAFE_CURRENT,)
 
 
 class OrderNumber(ChargerEntity, NumberEntity):
@@ -282,15 +284,15 @@ class OrderNumber(ChargerEntity, NumberEntity):
     def __init__(
         self,
         coordinator: BusCoordinator,
-        unit: ChargerUnit,
+        managed: ManagedCharger,
         description: OrderNumberDescription,
     ) -> None:
         """Belong to the charger."""
-        super().__init__(coordinator, unit, description)
+        super().__init__(coordinator, managed, description)
         self._order = description
 
     @override
-    def show(self) -> Hashable:
+    def update_attributes(self) -> Hashable:
         """Show the order that counts, and what may be asked for."""
         order = self._order
         limits = self.charger.limits
@@ -303,7 +305,7 @@ class OrderNumber(ChargerEntity, NumberEntity):
     @override
     async def async_set_native_value(self, value: float) -> None:
         """Order a value; return when the charger follows it."""
-        with translated_errors(self.unit.name, self.coordinator.port):
+        with translated_errors(self.managed.name, self.coordinator.port):
             await self.charger.change_orders(self._order.change(value))
 
 
@@ -313,25 +315,25 @@ class SettingNumber(SettingEntity, NumberEntity):
     def __init__(
         self,
         coordinator: BusCoordinator,
-        unit: ChargerUnit,
+        managed: ManagedCharger,
         description: SettingNumberDescription,
     ) -> None:
         """Belong to the charger."""
-        super().__init__(coordinator, unit, description, description.setting)
+        super().__init__(coordinator, managed, description, description.setting)
 
     @override
-    def show(self) -> Hashable:
+    def update_attributes(self) -> Hashable:
         """Show what the box told, and what can be set."""
-        reach = self.reach
-        self._attr_native_value = self.told
+        reach = self.value_range
+        self._attr_native_value = self.stored_value
         self._attr_native_min_value = reach.minimum
         self._attr_native_max_value = reach.maximum
-        return (self.told, reach)
+        return (self.stored_value, reach)
 
     @override
     async def async_set_native_value(self, value: float) -> None:
         """Write it into the box; return when it is read back."""
-        with translated_errors(self.unit.name, self.coordinator.port):
+        with translated_errors(self.managed.name, self.coordinator.port):
             await self.charger.configure(self.setting, whole(value))
 
 
@@ -346,7 +348,7 @@ class SupplyNumber(BusEntity, NumberEntity):
         self._supply = supply
 
     @override
-    def show(self) -> Hashable:
+    def update_attributes(self) -> Hashable:
         """Show the order that counts, and what may be asked for."""
         self._attr_native_value = self._supply.limit
         self._attr_native_max_value = self._supply.installed.limit
@@ -355,5 +357,7 @@ class SupplyNumber(BusEntity, NumberEntity):
     @override
     async def async_set_native_value(self, value: float) -> None:
         """Order it; return when it counts."""
-        with translated_errors(self.coordinator.entry.title, self.coordinator.port):
+        with translated_errors(
+            self.coordinator.config_entry.title, self.coordinator.port
+        ):
             await self.coordinator.async_order_supply(value)

@@ -12,7 +12,7 @@ from .coordinator import BusCoordinator, EvseBusConfigEntry
 from .entity import ChargerEntity, SettingEntity, add_charger_entities
 from .errors import translated_errors
 from .evse.model import Capability, Command, Mode, Setting
-from .unit import ChargerUnit
+from .managed_charger import ManagedCharger
 
 PARALLEL_UPDATES = 0
 
@@ -41,19 +41,21 @@ async def async_setup_entry(
     add_charger_entities(Platform.SELECT, entry, async_add_entities, _selects)
 
 
-def _selects(coordinator: BusCoordinator, unit: ChargerUnit) -> Iterable[SelectEntity]:
-    charger = unit.charger
+def _selects(
+    coordinator: BusCoordinator, managed: ManagedCharger
+) -> Iterable[SelectEntity]:
+    charger = managed.charger
     if Capability.MODE in charger.capabilities:
-        yield ModeSelect(coordinator, unit, MODE)
+        yield ModeSelect(coordinator, managed, MODE)
     if Setting.MODE_AT_START in charger.settings:
-        yield ModeAtStartSelect(coordinator, unit, MODE_AT_START)
+        yield ModeAtStartSelect(coordinator, managed, MODE_AT_START)
 
 
 class ModeSelect(ChargerEntity, SelectEntity):
     """What decides how much the box offers; it forgets that without power."""
 
     @override
-    def show(self) -> Hashable:
+    def update_attributes(self) -> Hashable:
         """Show what the box says."""
         reading = self.charger.reading
         self._attr_current_option = reading.mode if reading is not None else None
@@ -62,7 +64,7 @@ class ModeSelect(ChargerEntity, SelectEntity):
     @override
     async def async_select_option(self, option: str) -> None:
         """Command it; return when the box follows."""
-        with translated_errors(self.unit.name, self.coordinator.port):
+        with translated_errors(self.managed.name, self.coordinator.port):
             await self.charger.command(Command.SET_MODE, Mode(option))
 
 
@@ -72,21 +74,21 @@ class ModeAtStartSelect(SettingEntity, SelectEntity):
     def __init__(
         self,
         coordinator: BusCoordinator,
-        unit: ChargerUnit,
+        managed: ManagedCharger,
         description: SelectEntityDescription,
     ) -> None:
         """Belong to the charger."""
-        super().__init__(coordinator, unit, description, Setting.MODE_AT_START)
+        super().__init__(coordinator, managed, description, Setting.MODE_AT_START)
 
     @override
-    def show(self) -> Hashable:
+    def update_attributes(self) -> Hashable:
         """Show what the box told."""
-        told = self.told
+        told = self.stored_value
         self._attr_current_option = None if told is None else MODES[told]
         return told
 
     @override
     async def async_select_option(self, option: str) -> None:
         """Write it into the box; return when it is read back."""
-        with translated_errors(self.unit.name, self.coordinator.port):
+        with translated_errors(self.managed.name, self.coordinator.port):
             await self.charger.configure(self.setting, MODES.index(Mode(option)))

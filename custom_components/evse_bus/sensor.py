@@ -18,7 +18,7 @@ from homeassistant.core import HomeAssistant
 from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
 from homeassistant.util import dt as dt_util
 
-from .connections import ListenerLines
+from .connections import ListenerConnections
 from .coordinator import (
     BUS,
     STATISTICS,
@@ -36,6 +36,7 @@ from .entity import (
     supported,
 )
 from .evse.model import Capability, Fault
+from .managed_charger import ManagedCharger
 from .sensor_counts import (
     BUS_SENSORS,
     CHARGER_STATISTICS,
@@ -55,7 +56,6 @@ from .sensor_tables import (
     ChargerSensorDescription,
     ConnectorSensorDescription,
 )
-from .unit import ChargerUnit
 
 PARALLEL_UPDATES = 0
 
@@ -74,7 +74,7 @@ async def async_setup_entry(
             )
             for description in BUS_SENSORS
         )
-    if isinstance(lines := coordinator.lines, ListenerLines):
+    if isinstance(lines := coordinator.connections, ListenerConnections):
         boxes = BusSensor(coordinator, CONNECTED_BOXES, lambda: lines.connected, BUS)
         async_add_entities([boxes])
         async_add_entities(
@@ -84,57 +84,61 @@ async def async_setup_entry(
     add_charger_entities(Platform.SENSOR, entry, async_add_entities, _sensors)
 
 
-def _sensors(coordinator: BusCoordinator, unit: ChargerUnit) -> Iterable[SensorEntity]:
-    charger = unit.charger
-    yield from _line_sensors(coordinator, unit)
-    for description in supported(unit, CHARGER_SENSORS):
-        yield ChargerSensor(coordinator, unit, description)
+def _sensors(
+    coordinator: BusCoordinator, managed: ManagedCharger
+) -> Iterable[SensorEntity]:
+    charger = managed.charger
+    yield from _line_sensors(coordinator, managed)
+    for description in supported(managed, CHARGER_SENSORS):
+        yield ChargerSensor(coordinator, managed, description)
     for statistic in CHARGER_STATISTICS:
         # Another charger may be behind it after a changed set-up.
         yield ChargerStatistic(
-            coordinator, unit, statistic, partial(_counted, unit, statistic)
+            coordinator, managed, statistic, partial(_counted, managed, statistic)
         )
     if Capability.FAULTS in charger.capabilities:
-        yield FaultSensor(coordinator, unit, FAULT)
-    for number in sorted(unit.numbers):
-        for connector_description in supported(unit, CONNECTOR_SENSORS):
-            yield ConnectorSensor(coordinator, unit, number, connector_description)
+        yield FaultSensor(coordinator, managed, FAULT)
+    for number in sorted(managed.connector_numbers):
+        for connector_description in supported(managed, CONNECTOR_SENSORS):
+            yield ConnectorSensor(coordinator, managed, number, connector_description)
         if Capability.ENERGY in charger.capabilities:
-            yield EnergySensor(coordinator, unit, number, ENERGY)
+            yield EnergySensor(coordinator, managed, number, ENERGY)
         if Capability.ESTIMATED_ENERGY in charger.capabilities:
-            yield EstimatedEnergySensor(coordinator, unit, number, ESTIMATED_ENERGY)
+            yield EstimatedEnergySensor(coordinator, managed, number, ESTIMATED_ENERGY)
 
 
 def _line_sensors(
-    coordinator: BusCoordinator, unit: ChargerUnit
+    coordinator: BusCoordinator, managed: ManagedCharger
 ) -> Iterable[SensorEntity]:
     """Return what is counted of the line that a box has for itself."""
-    if unit.leads and coordinator.bus is None:
+    if managed.is_primary_port and coordinator.bus is None:
         for description in BUS_SENSORS:
             yield ChargerStatistic(
                 coordinator,
-                unit,
+                managed,
                 description,
-                partial(_counted_of_line, unit, description),
+                partial(_counted_of_line, managed, description),
                 whole=True,
             )
 
 
-def _counted(unit: ChargerUnit, description: StatisticDescription) -> float | None:
-    return description.value(unit.charger)
+def _counted(
+    managed: ManagedCharger, description: StatisticDescription
+) -> float | None:
+    return description.value(managed.charger)
 
 
 def _counted_of_line(
-    unit: ChargerUnit, description: BusSensorDescription
+    managed: ManagedCharger, description: BusSensorDescription
 ) -> float | None:
-    return description.value(unit.bus)
+    return description.value(managed.bus)
 
 
 class _ValueSensor(EvseBusEntity, SensorEntity):
     """A sensor whose state is one value."""
 
     @override
-    def show(self) -> Hashable:
+    def update_attributes(self) -> Hashable:
         """Show the value."""
         self._attr_native_value = value = self.value()
         return value
@@ -170,11 +174,11 @@ class ChargerSensor(ChargerEntity, _ValueSensor):
     def __init__(
         self,
         coordinator: BusCoordinator,
-        unit: ChargerUnit,
+        managed: ManagedCharger,
         description: ChargerSensorDescription,
     ) -> None:
         """Be told with the charger."""
-        super().__init__(coordinator, unit, description, whole=description.whole)
+        super().__init__(coordinator, managed, description, whole=description.whole)
         self._value = description.value
 
     @override
@@ -189,14 +193,14 @@ class ChargerStatistic(ChargerEntity, _ValueSensor):
     def __init__(
         self,
         coordinator: BusCoordinator,
-        unit: ChargerUnit,
+        managed: ManagedCharger,
         description: SensorEntityDescription,
         value: Callable[[], float | None],
         *,
         whole: bool = False,
     ) -> None:
         """Be told from time to time."""
-        super().__init__(coordinator, unit, description, STATISTICS, whole=whole)
+        super().__init__(coordinator, managed, description, STATISTICS, whole=whole)
         self._value = value
 
     @override
@@ -219,7 +223,7 @@ class FaultSensor(ChargerEntity, SensorEntity):
         return self.charger.available or bool(self.charger.noticed)
 
     @override
-    def show(self) -> Hashable:
+    def update_attributes(self) -> Hashable:
         """Show the first fault in the order of their list; waiting comes last."""
         faults = [fault for fault in Fault if fault in self.charger.faults]
         faults.sort(key=lambda fault: fault in WAITING)
@@ -239,12 +243,12 @@ class ConnectorSensor(ConnectorEntity, _ValueSensor):
     def __init__(
         self,
         coordinator: BusCoordinator,
-        unit: ChargerUnit,
+        managed: ManagedCharger,
         number: int,
         description: ConnectorSensorDescription,
     ) -> None:
         """Be told with the connector."""
-        super().__init__(coordinator, unit, number, description)
+        super().__init__(coordinator, managed, number, description)
         self._value = description.value
 
     @override
@@ -273,7 +277,7 @@ class EnergySensor(ConnectorEntity, RestoreSensor):
         await super().async_added_to_hass()
 
     @override
-    def show(self) -> Hashable:
+    def update_attributes(self) -> Hashable:
         """Show the total; unknown while the meter is not told."""
         reading = self.reading
         shown = None
@@ -317,7 +321,7 @@ class EstimatedEnergySensor(ConnectorEntity, RestoreSensor):
         await super().async_added_to_hass()
 
     @override
-    def show(self) -> Hashable:
+    def update_attributes(self) -> Hashable:
         """Add what came since the last look."""
         reading = self.reading
         summed = reading.estimated_energy if reading is not None else None

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from homeassistant.helpers.device_registry import AnyDeviceEntry
 
     from .coordinator import BusCoordinator, EvseBusConfigEntry
-    from .unit import ChargerUnit
+    from .managed_charger import ManagedCharger
 
 CONF_TOTAL: Final = "total"
 
@@ -134,8 +134,8 @@ def async_register(hass: HomeAssistant) -> None:
 
 
 async def _async_run(action: Action, call: ServiceCall) -> ServiceResponse:
-    coordinator, unit, charger = _target(call, of_port=action.of_port)
-    name = unit.name if action.of_port else unit.subentry.title
+    coordinator, managed, charger = _target(call, of_port=action.of_port)
+    name = managed.name if action.of_port else managed.subentry.title
     with translated_errors(name, coordinator.port):
         try:
             return await action.run(charger, call.data)
@@ -150,7 +150,7 @@ async def _async_run(action: Action, call: ServiceCall) -> ServiceResponse:
 
 def _target(
     call: ServiceCall, *, of_port: bool
-) -> tuple[BusCoordinator, ChargerUnit, EwsPort]:
+) -> tuple[BusCoordinator, ManagedCharger, EwsPort]:
     """Return who is meant; raises ServiceValidationError.
 
     The box stands for its first port: that is as good as any for what concerns the
@@ -163,16 +163,17 @@ def _target(
     keys = {key for domain, key in device.identifiers if domain == DOMAIN}
     coordinator = entry.runtime_data
     ports = [
-        (unit, unit.charger)
-        for unit in coordinator.units.values()
-        if {unit.key, unit.subentry_id} & keys and isinstance(unit.charger, EwsPort)
+        (managed, managed.charger)
+        for managed in coordinator.chargers.values()
+        if {managed.key, managed.subentry_id} & keys
+        and isinstance(managed.charger, EwsPort)
     ]
     if not ports:
         raise wrong_action(ActionError.NOT_EWS_BOX, device=_name(device))
     if of_port and len(ports) > 1:
         raise wrong_action(ActionError.CHOOSE_PORT, device=_name(device))
-    unit, charger = min(ports, key=lambda one: one[1].port)
-    return coordinator, unit, charger
+    managed, charger = min(ports, key=lambda one: one[1].port)
+    return coordinator, managed, charger
 
 
 def _name(device: AnyDeviceEntry) -> str:

@@ -1,9 +1,8 @@
-"""What the chargers of one bus share, where Home Assistant is their master.
+"""The current that the chargers of one bus share, where we are their master.
 
-The installation gives so much (a reconfiguration changes that); the user's order,
-within it, is what they may share now: an automation brings it down to what the sun
-leaves over, for instance. As with a charger's orders a lowering is on disk before it
-counts, and the order is there before the port opens.
+The installation sets an upper bound, which a reconfiguration changes. The user's order
+stays within it: an automation may lower it to the solar surplus, for example. As with
+a charger's orders, a lowering is on disk before it takes effect.
 """
 
 from collections.abc import Awaitable, Callable
@@ -15,66 +14,67 @@ from .evse.safety import number, round_down
 from .orders import OrderStore, SupplyOrder
 
 STEP: Final = 0.1
-"""Step in which currents are shared out, A."""
+"""Resolution of the shared current, A."""
 
 
 class SharedSupply:
-    """What one bus's chargers share."""
+    """The supply that the chargers of one bus share."""
 
     def __init__(
         self,
         installed: Supply,
         orders: OrderStore,
-        follow: Callable[[Supply], Awaitable[None]],
+        apply: Callable[[Supply], Awaitable[None]],
     ) -> None:
-        """Begin with nothing read yet; ``follow`` tells the master what counts.
+        """Read and apply nothing yet.
 
-        It returns when the chargers have heard of it.
+        ``installed`` is the limit of the installation. ``apply`` passes a supply to
+        the master of the bus and returns when it has been broadcast.
         """
         self.installed = installed
         self._orders = orders
-        self._follow = follow
+        self._apply = apply
 
     @property
     def limit(self) -> float:
-        """Return what the chargers may draw together now, A a phase."""
+        """Return the current limit in effect, for all chargers together, A per phase."""
         order = self._orders.supply
         if order is None or order.limit is None:
             return self.installed.limit
         return min(order.limit, self.installed.limit)
 
-    async def async_begin(self, *, new: bool) -> bool:
-        """Follow the stored order; return false when it is lost.
+    async def async_start(self, *, is_new: bool) -> bool:
+        """Apply the stored order; return false when it is lost.
 
-        A ``new`` bus has none yet, and may share all that the installation gives.
-        Where there must have been one, as little as lets one car charge counts.
+        A new bus has none and may use the limit of the installation. When a stored
+        order is missing, the limit becomes the least that lets one car charge.
         """
-        lost = self._orders.supply is None and not new
+        lost = self._orders.supply is None and not is_new
         if self._orders.supply is None:
             least = min(self.installed.minimum, self.installed.limit)
             await self._orders.async_commit_supply(SupplyOrder(least if lost else None))
-        await self._async_tell()
+        await self._async_apply()
         return not lost
 
     async def async_order(self, value: float) -> None:
-        """Let the chargers share this much, A a phase; rounded down.
+        """Limit the sum of all chargers, A per phase; rounded down to `STEP`.
 
-        Raises RefusedOrderError for what is not a finite number from 0 to what the
-        installation gives.
+        Raises RefusedOrderError unless it is a finite number from 0 to the limit of
+        the installation.
         """
-        wish = number(value, "supply")
-        if wish > self.installed.limit:
-            message = f"{wish:g} A is above the {self.installed.limit:g} A limit"
+        limit = number(value, "supply")
+        if limit > self.installed.limit:
+            message = f"{limit:g} A is above the {self.installed.limit:g} A limit"
             raise RefusedOrderError(message)
-        await self._orders.async_commit_supply(SupplyOrder(round_down(wish, STEP)))
-        # What was ordered meanwhile is newer and counts.
-        await self._async_tell()
+        await self._orders.async_commit_supply(SupplyOrder(round_down(limit, STEP)))
+        # Reads the limit again: a newer order may have been stored in the meantime.
+        await self._async_apply()
 
-    async def async_set_up(self, installed: Supply) -> None:
-        """Follow a changed set-up at once."""
+    async def async_update_installed(self, installed: Supply) -> None:
+        """Apply a changed limit of the installation."""
         if installed != self.installed:
             self.installed = installed
-            await self._async_tell()
+            await self._async_apply()
 
-    async def _async_tell(self) -> None:
-        await self._follow(Supply(limit=self.limit, minimum=self.installed.minimum))
+    async def _async_apply(self) -> None:
+        await self._apply(Supply(limit=self.limit, minimum=self.installed.minimum))

@@ -20,7 +20,7 @@ from .errors import translated_errors
 from .evse.charger import Charger
 from .evse.model import Capability, Command, OrderChange
 from .evse.readings import ConnectorReading
-from .unit import ChargerUnit
+from .managed_charger import ManagedCharger
 
 PARALLEL_UPDATES = 0
 
@@ -116,13 +116,15 @@ async def async_setup_entry(
     add_charger_entities(Platform.SWITCH, entry, async_add_entities, _switches)
 
 
-def _switches(coordinator: BusCoordinator, unit: ChargerUnit) -> Iterable[SwitchEntity]:
-    yield AllowedSwitch(coordinator, unit, ALLOWED)
-    for description in supported(unit, COMMANDS):
-        yield CommandSwitch(coordinator, unit, description)
-    for number in sorted(unit.numbers):
-        for connector_description in supported(unit, CONNECTOR_COMMANDS):
-            yield ConnectorSwitch(coordinator, unit, number, connector_description)
+def _switches(
+    coordinator: BusCoordinator, managed: ManagedCharger
+) -> Iterable[SwitchEntity]:
+    yield AllowedSwitch(coordinator, managed, ALLOWED)
+    for description in supported(managed, COMMANDS):
+        yield CommandSwitch(coordinator, managed, description)
+    for number in sorted(managed.connector_numbers):
+        for connector_description in supported(managed, CONNECTOR_COMMANDS):
+            yield ConnectorSwitch(coordinator, managed, number, connector_description)
 
 
 class _ChargerSwitch(ChargerEntity, SwitchEntity):
@@ -131,13 +133,13 @@ class _ChargerSwitch(ChargerEntity, SwitchEntity):
     @override
     async def async_turn_on(self, **kwargs: Any) -> None:
         """Switch on; return when the charger follows."""
-        with translated_errors(self.unit.name, self.coordinator.port):
+        with translated_errors(self.managed.name, self.coordinator.port):
             await self.turn(on=True)
 
     @override
     async def async_turn_off(self, **kwargs: Any) -> None:
         """Switch off; return when the charger follows."""
-        with translated_errors(self.unit.name, self.coordinator.port):
+        with translated_errors(self.managed.name, self.coordinator.port):
             await self.turn(on=False)
 
     async def turn(self, *, on: bool) -> None:
@@ -149,7 +151,7 @@ class AllowedSwitch(_ChargerSwitch):
     """Whether a car may charge; apart from how much."""
 
     @override
-    def show(self) -> Hashable:
+    def update_attributes(self) -> Hashable:
         """Show what the charger says; where it cannot, what was ordered.
 
         What is stopped by ourselves for want of current is allowed: nobody has to
@@ -174,16 +176,16 @@ class CommandSwitch(_ChargerSwitch):
     def __init__(
         self,
         coordinator: BusCoordinator,
-        unit: ChargerUnit,
+        managed: ManagedCharger,
         description: CommandSwitchDescription,
     ) -> None:
         """Belong to the charger."""
-        super().__init__(coordinator, unit, description)
+        super().__init__(coordinator, managed, description)
         self._value = description.value
         self._command = description.command
 
     @override
-    def show(self) -> Hashable:
+    def update_attributes(self) -> Hashable:
         """Show what the charger says."""
         self._attr_is_on = self._value(self.charger)
         return self._attr_is_on
@@ -200,16 +202,16 @@ class ConnectorSwitch(ConnectorEntity, _ChargerSwitch):
     def __init__(
         self,
         coordinator: BusCoordinator,
-        unit: ChargerUnit,
+        managed: ManagedCharger,
         number: int,
         description: ConnectorSwitchDescription,
     ) -> None:
         """Belong to the connector."""
-        super().__init__(coordinator, unit, number, description)
+        super().__init__(coordinator, managed, number, description)
         self._description = description
 
     @override
-    def show(self) -> Hashable:
+    def update_attributes(self) -> Hashable:
         """Show what the charger says."""
         reading = self.reading
         value = None if reading is None else self._description.value(reading)

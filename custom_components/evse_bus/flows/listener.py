@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, Final, override
 
 from homeassistant.components import network
 from homeassistant.config_entries import (
-    ConfigEntry,
     ConfigEntryState,
     ConfigFlow,
     ConfigFlowContext,
@@ -39,9 +38,11 @@ from ..const import (
     CONF_ALLOWED,
     CONF_PROTOCOL,
     CONF_SERIAL,
+    DOMAIN,
     LOGGER,
     SUBENTRY_CHARGER,
 )
+from ..coordinator import EvseBusConfigEntry
 from ..discovery import CONF_ENTRY, CONF_FIRMWARE, CONF_PEER, box_unique_id, is_set_up
 from ..evse.errors import (
     EvseError,
@@ -168,7 +169,7 @@ class ListenerSteps(ChargerSteps[ConfigFlowContext, ConfigFlowResult, str], Conf
     def __init__(self) -> None:
         """Start without a listener."""
         super().__init__()
-        self._listener: ConfigEntry | None = None
+        self._listener: EvseBusConfigEntry | None = None
         """Whose box is being added."""
         self._discovered: FoundCharger
         self._peer = ""
@@ -221,7 +222,7 @@ class ListenerSteps(ChargerSteps[ConfigFlowContext, ConfigFlowResult, str], Conf
         self,
         step_id: str,
         typed: dict[str, Any] | None,
-        entry: ConfigEntry | None = None,
+        entry: EvseBusConfigEntry | None = None,
     ) -> tuple[dict[str, Any], ConfigFlowResult | None]:
         """Return an entry's data, or the form to show; ``entry`` is being changed."""
         errors: Errors = {}
@@ -244,7 +245,7 @@ class ListenerSteps(ChargerSteps[ConfigFlowContext, ConfigFlowResult, str], Conf
         )
 
     async def _async_check_listen(
-        self, where: Mapping[str, Any], entry: ConfigEntry | None
+        self, where: Mapping[str, Any], entry: EvseBusConfigEntry | None
     ) -> Errors:
         """Return what is wrong; aborts when another entry listens there."""
         self._async_abort_entries_match(dict(where))
@@ -319,7 +320,7 @@ class ListenerSteps(ChargerSteps[ConfigFlowContext, ConfigFlowResult, str], Conf
         [box] = boxes
         entries = self.hass.config_entries
         entry = self._listener
-        if entry is None or entries.async_get_entry(entry.entry_id) is not entry:
+        if entry is None or entry not in entries.async_entries(DOMAIN):
             return self.async_abort(reason="listener_gone")
         unique_id = box["unique_id"]
         if unique_id is not None and is_set_up(self.hass, unique_id):

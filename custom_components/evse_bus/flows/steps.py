@@ -10,7 +10,7 @@ from homeassistant.const import CONF_ADDRESS, CONF_NAME
 from homeassistant.data_entry_flow import FlowContext, FlowHandler, FlowResult
 
 from ..configuration import charger_unique_id, line_settings
-from ..connections import line_name
+from ..connections import connection_name
 from ..const import (
     CONF_INSTALLATION_LIMIT,
     SUBENTRY_CHARGER,
@@ -214,7 +214,7 @@ class ChargerSteps[
     def placeholders(self) -> dict[str, str]:
         """Return what texts may name of the bus."""
         return {
-            "port": line_name(self.bus_data),
+            "port": connection_name(self.bus_data),
             "protocol": self.protocol.name,
             "settings": str(line_settings(self.bus_data)),
         }

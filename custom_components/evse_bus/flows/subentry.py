@@ -14,7 +14,7 @@ from homeassistant.config_entries import (
 from homeassistant.const import CONF_ADDRESS, CONF_NAME
 
 from ..configuration import charger_unique_id, protocol_of
-from ..connections import Lines, ListenerLines
+from ..connections import Connections, ListenerConnections
 from ..const import (
     CONF_FAIL_SAFE_CURRENT,
     CONF_FAIL_SAFE_TIMEOUT,
@@ -88,18 +88,18 @@ class ChargerSubentryFlow(
         """Return whether no further charger can be on this bus."""
         return ADDRESSES[self.protocol.key].alone and bool(self.others())
 
-    def _lines(self) -> Lines | None:
+    def _lines(self) -> Connections | None:
         """Return the lines of the bus; ``None``: it is not set up now."""
         entry: EvseBusConfigEntry = self._get_entry()
         if entry.state is not ConfigEntryState.LOADED:
             return None
-        return entry.runtime_data.lines
+        return entry.runtime_data.connections
 
     @override
     def waiting(self) -> list[str]:
         """Return the serial numbers of boxes that have dialled and are not set up."""
         lines = self._lines()
-        if not isinstance(lines, ListenerLines):
+        if not isinstance(lines, ListenerConnections):
             return []
         strangers = lines.listener.strangers
         self._report = ScanReport(
@@ -111,10 +111,10 @@ class ChargerSubentryFlow(
     async def async_scan(self, progress: Progress) -> ScanReport:
         """Search between the turns of the chargers that are running."""
         lines = self._lines()
-        if lines is None or lines.only is None:
+        if lines is None or lines.shared_bus is None:
             raise NotAvailableError(self._get_entry().title)
         searches = nothing_imposed(self.protocol)
-        return await async_search(self.protocol, lines.only, searches, progress)
+        return await async_search(self.protocol, lines.shared_bus, searches, progress)
 
     @override
     def finish(self, chargers: list[ConfigSubentryData]) -> SubentryFlowResult:
