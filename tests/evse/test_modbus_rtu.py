@@ -1,11 +1,11 @@
 """Modbus RTU frames: found by length and checksum, whatever surrounds them."""
 
-from itertools import pairwise
+from itertools import accumulate, pairwise
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hypothesis import example, given, strategies as st
+from hypothesis import assume, example, given, strategies as st
 from pymodbus.framer import FramerRTU
 from pymodbus.pdu import DecodePDU
 import pytest
@@ -36,12 +36,46 @@ WRITE = bytes.fromhex("001000a6000102008cb2a3")
 WRITTEN = bytes.fromhex("001000a70001b1fb")
 SINGLE = bytes.fromhex("000600a70001f838")
 BROADCAST = bytes.fromhex("0010000100040800000000000000008ab9")
+ENDS_IN_00 = bytes.fromhex("000304" + "00000184" + "eb00")
+"""An answer of two words; without its last byte a request with a good checksum."""
 TRACE = json.loads(
     (Path(__file__).parents[1] / "traces" / "smartevse_v2_17.json").read_text()
 )
 
+FUNCTIONS = (3, 4, 6, 16)
+
 _units = st.integers(0, 247)
 _words = st.integers(0, 0xFFFF)
+
+
+def _lengths(data: bytes) -> set[int]:
+    """Return the lengths of all frames that data may begin with, by their shape."""
+    if len(data) < 2 or data[1] & 0x7F not in FUNCTIONS:
+        return set()
+    if data[1] & 0x80:
+        return {5}
+    counts = {3: 2, 4: 2, 16: 6}
+    place = counts.get(data[1])
+    counted = {place + 3 + data[place]} if place and place < len(data) else set()
+    return {5, 8} | counted
+
+
+def has_two_readings(raws: Sequence[bytes]) -> bool:
+    """Return whether good checksums show other frames than these in a stream.
+
+    A checksum stays good when 00 follows, and frames of unit 0 begin with it.
+    """
+    stream = b"".join(raws) + b"\0"
+    ends = list(accumulate(map(len, raws)))
+    meant = set(zip([0, *ends], ends, strict=False))
+    found = {
+        (start, start + length)
+        for start in range(len(stream))
+        for length in _lengths(stream[start:])
+        if start + length <= len(stream)
+        if crc(stream[start : start + length]) == b"\0\0"
+    }
+    return not found <= meant
 
 
 def _counted(function: int) -> st.SearchStrategy[bytes]:
@@ -92,7 +126,7 @@ _frames = st.one_of(
     ),
     _counted(3),
     _counted(4),
-)
+).filter(lambda raw: not has_two_readings([raw]))
 
 
 def feed(*chunks: bytes) -> tuple[list[ModbusFrame], RtuFramer]:
@@ -179,9 +213,39 @@ def test_any_frame_is_found(raw: bytes) -> None:
 
 @given(st.lists(_frames, min_size=1, max_size=5), st.lists(st.integers(0, 999)))
 def test_frames_in_any_lumps(raws: list[bytes], places: list[int]) -> None:
+    assume(not has_two_readings(raws))
     frames, framer = feed(*cut(b"".join(raws), places))
     assert [frame.raw for frame in frames] == raws
     assert (framer.noise, framer.pending) == (0, 0)
+
+
+REQUESTS = bytes.fromhex("00030400000184eb" + "00030000000185db")
+"""Read a register at 0x0400 of unit 0, then one at 0x0000."""
+
+
+@pytest.mark.parametrize("place", range(17))
+@pytest.mark.parametrize("stream", [ENDS_IN_00, ENDS_IN_00 + WRITE, REQUESTS])
+def test_an_answer_of_two_words_wins_over_a_request(stream: bytes, place: int) -> None:
+    """`REQUESTS` (found by the test above) has two readings, with good checksums.
+
+    The 00 of the second request fits the first: ``000304 00000184 eb00`` is an answer
+    of two words. No dialect has a register at 0x04xx (PROTOCOLS.md, 3), so nobody
+    sends the first; and whether an answer is found must depend neither on its value
+    nor on how an adapter cuts it.
+    """
+    frames, framer = feed(*cut(stream, [place]))
+    assert [frame.raw for frame in frames][:1] == [ENDS_IN_00]
+    assert registers_read(frames[0], 2, 3) == bytes.fromhex("00000184")
+    framer.reset()
+    assert sum(len(frame.raw) for frame in frames) + framer.noise == len(stream)
+    assert stream == REQUESTS or framer.noise == 0
+
+
+def test_a_request_that_may_be_an_answer_waits_for_the_next_byte() -> None:
+    request = rtu_frame(1, read_registers(0x0400, 1))
+    frames, framer = feed(request)
+    assert (frames, framer.pending) == ([], 8)
+    assert [frame.raw for frame in framer.feed(b"\x01")] == [request]
 
 
 # Bytes that are no function, so that no frame begins in them.
@@ -192,6 +256,9 @@ _noise = st.binary(max_size=12).map(lambda data: bytes(0x20 | (b & 0x1F) for b i
 def test_noise_around_a_frame(
     before: bytes, raw: bytes, after: bytes, places: list[int]
 ) -> None:
+    # A byte before it makes a longer frame that may still come of a weak one.
+    weak = len(raw) == 5 and not raw[1] & 0x80
+    assume(not (before and weak and raw[0] & 0x7F in FUNCTIONS))
     frames, framer = feed(*cut(before + raw + after, places))
     assert raw in [frame.raw for frame in frames]
     framer.reset()

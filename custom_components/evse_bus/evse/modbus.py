@@ -292,6 +292,11 @@ def _rtu_lengths(buffer: bytes, start: int) -> tuple[int, ...]:
     if function & EXCEPTION:
         return (_RTU_EXCEPTION,)
     counted = _rtu_counted(function, buffer[start : start + _RTU_FIXED])
+    if counted == (_RTU_FIXED + 1,) and len(buffer) - start == _RTU_FIXED:
+        # A request to read a register at 0x04xx, or an answer of two words that lacks
+        # its last byte: if that is 00, both checksums are good. No charger has such a
+        # register (PROTOCOLS.md, 3), so the byte is waited for.
+        return (*counted, _RTU_EXCEPTION)
     return (*counted, _RTU_FIXED, _RTU_EXCEPTION)
 
 
