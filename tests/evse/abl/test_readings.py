@@ -16,11 +16,11 @@ from custom_components.evse_bus.evse.abl.readings import (
     power_of,
 )
 from custom_components.evse_bus.evse.abl.registers import (
+    FLAGS,
+    INFO,
+    READING,
     Flags,
     Reading,
-    decode_flags,
-    decode_info,
-    decode_reading,
 )
 from custom_components.evse_bus.evse.model import UNKNOWN_PHASES, Fault, Status
 from custom_components.evse_bus.evse.readings import ChargerReading, ConnectorReading
@@ -28,9 +28,9 @@ from custom_components.evse_bus.evse.readings import ChargerReading, ConnectorRe
 if TYPE_CHECKING:
     from custom_components.evse_bus.evse.model import Phases
 
-WITH_METER = decode_info(bytes.fromhex("014150BE"))
+WITH_METER = INFO.decode(bytes.fromhex("014150BE"))
 WITHOUT_METER = replace(WITH_METER, meter=False)
-CLEAR = decode_flags(bytes.fromhex("06000000"))
+CLEAR = FLAGS.decode(bytes.fromhex("06000000"))
 FULL = Reading(
     state=0xC2,
     plugged=True,
@@ -190,13 +190,13 @@ def test_faults(what: Told, faults: set[Fault], codes: tuple[str, ...]) -> None:
     ],
 )
 def test_faults_in_flags(bits: int, fault: Fault, code: str) -> None:
-    reading, _ = read(told(flags=decode_flags(b"\x06\x00" + bits.to_bytes(2))))
+    reading, _ = read(told(flags=FLAGS.decode(b"\x06\x00" + bits.to_bytes(2))))
     assert reading.faults == {fault}
     assert reading.fault_codes == (code,)
 
 
 def test_five_percent_too_much_is_no_fault() -> None:
-    assert not read(told(flags=decode_flags(b"\x06\x00\x00\x01")))[0].faults
+    assert not read(told(flags=FLAGS.decode(b"\x06\x00\x00\x01")))[0].faults
 
 
 def test_info() -> None:
@@ -254,9 +254,9 @@ def test_any_registers_make_a_reading(
     reading: bytes, info: bytes, flags: bytes | None, order: list[int]
 ) -> None:
     what = Told(
-        reading=decode_reading(b"\x2e" + reading),
-        info=decode_info(b"\x01" + info),
-        flags=None if flags is None else decode_flags(b"\x06" + flags),
+        reading=READING.decode(b"\x2e" + reading),
+        info=INFO.decode(b"\x01" + info),
+        flags=None if flags is None else FLAGS.decode(b"\x06" + flags),
     )
     one, two, three = order
     currents = phase_currents(what, (one, two, three))

@@ -11,14 +11,8 @@ from custom_components.evse_bus.evse.abl.registers import (
     LONGEST_REQUEST,
     READING,
     SERIAL,
-    Block,
     Reading,
     StateCode,
-    decode_flags,
-    decode_icmax,
-    decode_info,
-    decode_reading,
-    decode_serial,
     limit_duty,
     read_answer,
     read_request,
@@ -33,11 +27,12 @@ from custom_components.evse_bus.evse.errors import (
 )
 from custom_components.evse_bus.evse.modbus import AsciiFramer, ModbusFrame
 from custom_components.evse_bus.evse.model import CurrentLimit, Limits, Orders
+from custom_components.evse_bus.evse.registers import Block
 from custom_components.evse_bus.evse.safety import Setpoint, clamp
 
 MODBUS_SETTINGS = Block(0x0003, 1)
 SHORT_READING = Block(0x0033, 3)
-STATE = Block(0x0004, 1, optional=True)
+STATE = Block(0x0004, 1)
 
 
 def setpoint(current: float) -> Setpoint:
@@ -62,11 +57,11 @@ def answer(text: str, address: int, block: Block) -> bytes:
 @pytest.mark.parametrize(
     ("block", "request_"),
     [
-        (INFO, ":010300010002F9"),
-        (READING, ":0103002E0005C9"),
+        (INFO.block, ":010300010002F9"),
+        (READING.block, ":0103002E0005C9"),
         (SHORT_READING, ":010300330003C6"),
         (MODBUS_SETTINGS, ":010300030001F8"),
-        (SERIAL, ":010300500008A4"),
+        (SERIAL.block, ":010300500008A4"),
         (Block(0x0014, 5), ":010300140005E3"),
     ],
 )
@@ -84,21 +79,21 @@ def test_write_requests() -> None:
 @pytest.mark.parametrize(
     ("text", "block"),
     [
-        (">01030401011237AD", INFO),
+        (">01030401011237AD", INFO.block),
         (">0103020327D0", MODBUS_SETTINGS),
-        (">010304010F1509CA", INFO),
+        (">010304010F1509CA", INFO.block),
         (">0103063300A1646464F6", SHORT_READING),
         (">01030A140002490AFA020001FF8D", Block(0x0014, 5)),
-        (">0103105000325732327879303132333435363722", SERIAL),
+        (">0103105000325732327879303132333435363722", SERIAL.block),
         # Printed with other checksums; these are the right ones (PROTOCOLS.md, 2).
-        (">01030A2EC3810A006400640000AE", READING),
+        (">01030A2EC3810A006400640000AE", READING.block),
         (">0103063380C30A0A006C", SHORT_READING),
         # Real boxes (PROTOCOLS.md, 2).
-        (">01030A2EA1106403E803E803E8EE", READING),
-        (">01030A2EB2910B03E803E803E8B5", READING),
-        (">01030A2EF4106403E803E803E89B", READING),
+        (">01030A2EA1106403E803E803E8EE", READING.block),
+        (">01030A2EB2910B03E803E803E8B5", READING.block),
+        (">01030A2EF4106403E803E803E89B", READING.block),
         (">01030204A155", STATE),
-        (">010304014150BEA8", INFO),
+        (">010304014150BEA8", INFO.block),
     ],
 )
 def test_answers(text: str, block: Block) -> None:
@@ -141,15 +136,15 @@ def test_a_request_is_never_taken_for_an_answer() -> None:
     (echo,) = frames(":011000140001DA")
     assert write_answer(1, 0x14)(echo) is None
     (read,) = frames(":01030A2EC3810A006400640000AE")
-    assert read_answer(1, READING)(read) is None
+    assert read_answer(1, READING.block)(read) is None
 
 
 # -- Fields --------------------------------------------------------------------------
 
 
 def test_reading() -> None:
-    data = answer(">01030A2EC3810A006400640000AE", 1, READING)
-    assert decode_reading(data) == Reading(
+    data = answer(">01030A2EC3810A006400640000AE", 1, READING.block)
+    assert READING.decode(data) == Reading(
         state=0xC3,
         plugged=True,
         reduced=False,
@@ -158,8 +153,8 @@ def test_reading() -> None:
         duty=0x10A,
         currents=(10.0, 10.0, 0.0),
     )
-    data = answer(">01030A2EB2910B03E803E803E8B5", 1, READING)
-    assert decode_reading(data) == Reading(
+    data = answer(">01030A2EB2910B03E803E803E8B5", 1, READING.block)
+    assert READING.decode(data) == Reading(
         state=0xB2,
         plugged=True,
         reduced=False,
@@ -171,7 +166,7 @@ def test_reading() -> None:
 
 
 def test_info() -> None:
-    info = decode_info(answer(">010304014150BEA8", 1, INFO))
+    info = INFO.decode(answer(">010304014150BEA8", 1, INFO.block))
     assert (info.hardware, info.device_id, info.firmware) == ("pcba 160307", 1, "5.0")
     assert info.coding_resistor
     assert not info.upstream_timeout
@@ -181,7 +176,7 @@ def test_info() -> None:
     assert info.welding_detection
     assert info.enable_input == "closed_for_enabled"
     # 1.3: V1.2, board 141215, DC monitoring, welding detection, attached cable.
-    info = decode_info(answer(">01030401011237AD", 1, INFO))
+    info = INFO.decode(answer(">01030401011237AD", 1, INFO.block))
     assert (info.hardware, info.firmware) == ("pcba 141215", "1.2")
     assert (info.meter, info.rdc_md, info.socket) == (True, True, False)
     assert info.enable_input == "invalid"
@@ -202,22 +197,22 @@ def test_info() -> None:
     ],
 )
 def test_flags(bit: int, name: str, expected: bool) -> None:  # noqa: FBT001
-    clear = decode_flags(b"\x06\x42\x00\x00")
+    clear = FLAGS.decode(b"\x06\x42\x00\x00")
     assert (clear.pointer, clear.overcurrent, clear.china) == (0x42, 0, False)
     assert getattr(clear, name) is not expected
-    flags = decode_flags(b"\x06\x00" + (1 << bit).to_bytes(2))
+    flags = FLAGS.decode(b"\x06\x00" + (1 << bit).to_bytes(2))
     assert getattr(flags, name) is expected
     assert sum(getattr(flags, each) is True for each in type(flags).__slots__) == 1
 
 
 def test_limits_for_china() -> None:
     assert [
-        decode_flags(b"\x06\x00" + (bits << 12).to_bytes(2)).china for bits in range(4)
+        FLAGS.decode(b"\x06\x00" + (bits << 12).to_bytes(2)).china for bits in range(4)
     ] == [False, False, True, False]
 
 
 def test_overcurrent() -> None:
-    assert [decode_flags(bytes((6, 0, 0, bits))).overcurrent for bits in range(8)] == [
+    assert [FLAGS.decode(bytes((6, 0, 0, bits))).overcurrent for bits in range(8)] == [
         0,
         100,
         None,
@@ -230,18 +225,18 @@ def test_overcurrent() -> None:
 
 
 def test_serial() -> None:
-    data = answer(">0103105000325732327879303132333435363722", 1, SERIAL)
-    assert decode_serial(data) == "2W22xy01234567"
-    assert decode_serial(b"\x50\x00SHORT".ljust(16, b"\0")) == "SHORT"
+    data = answer(">0103105000325732327879303132333435363722", 1, SERIAL.block)
+    assert SERIAL.decode(data).number == "2W22xy01234567"
+    assert SERIAL.decode(b"\x50\x00SHORT".ljust(16, b"\0")).number == "SHORT"
 
 
 @pytest.mark.parametrize("text", [bytes(14), b"\xff" * 14, b"2W\x01" + bytes(11)])
 def test_no_serial(text: bytes) -> None:
-    assert decode_serial(b"\x50\x00" + text) is None
+    assert SERIAL.decode(b"\x50\x00" + text).number is None
 
 
 def test_icmax() -> None:
-    assert decode_icmax(bytes.fromhex("0FA100000000F10A0000")) == 0x10A
+    assert ICMAX.decode(bytes.fromhex("0FA100000000F10A0000")).duty == 0x10A
 
 
 # -- Any bytes -----------------------------------------------------------------------
@@ -249,7 +244,7 @@ def test_icmax() -> None:
 
 @given(st.binary(min_size=9, max_size=9))
 def test_any_reading_can_be_decoded(data: bytes) -> None:
-    reading = decode_reading(b"\x2e" + data)
+    reading = READING.decode(b"\x2e" + data)
     assert reading.state == data[0]
     for current in reading.currents:
         assert current is None or 0 <= current <= 80
@@ -257,10 +252,10 @@ def test_any_reading_can_be_decoded(data: bytes) -> None:
 
 @given(st.binary(min_size=3, max_size=3), st.binary(min_size=15, max_size=15))
 def test_any_block_can_be_decoded(short: bytes, long: bytes) -> None:
-    assert decode_info(b"\x01" + short).firmware
-    assert decode_flags(b"\x06" + short).pointer == short[0]
-    assert 0 <= decode_icmax(b"\x0f" + long[:9]) <= 0xFFF
-    serial = decode_serial(b"\x50" + long)
+    assert INFO.decode(b"\x01" + short).firmware
+    assert FLAGS.decode(b"\x06" + short).pointer == short[0]
+    assert 0 <= ICMAX.decode(b"\x0f" + long[:9]).duty <= 0xFFF
+    serial = SERIAL.decode(b"\x50" + long).number
     assert serial is None or (serial.isprintable() and len(serial) <= 14)
 
 
@@ -278,7 +273,7 @@ def test_a_reading_comes_back_as_it_was_put_in(
 ) -> None:
     words = [plugged << 15 | duty, *(0x3E8 if c is None else c for c in currents)]
     data = bytes((0x2E, state)) + b"".join(word.to_bytes(2) for word in words)
-    reading = decode_reading(data)
+    reading = READING.decode(data)
     assert (reading.state, reading.plugged, reading.duty) == (state, plugged, duty)
     assert reading.currents == tuple(None if c is None else c / 10 for c in currents)
 
@@ -292,7 +287,7 @@ def test_any_frame_can_be_offered(content: bytes) -> None:
         function=content[0] if content else 3,
         data=content[1:],
     )
-    for accept in (read_answer(1, READING), write_answer(1, 0x14)):
+    for accept in (read_answer(1, READING.block), write_answer(1, 0x14)):
         try:
             accept(frame)
         except ExchangeRefusedError:
@@ -305,7 +300,7 @@ def test_any_frame_can_be_offered(content: bytes) -> None:
 @pytest.mark.parametrize("address", [0, 17, 255, -1])
 def test_nothing_is_said_to_all_or_nobody(address: int) -> None:
     for encode in (
-        lambda: read_request(address, READING),
+        lambda: read_request(address, READING.block),
         lambda: write_limit(address, setpoint(10)),
         lambda: write_state(address, StateCode.E0),
         lambda: write_configuration(address, 1),
@@ -351,5 +346,5 @@ def test_lengths_that_the_bus_plans_with() -> None:
     assert len(write_limit(1, setpoint(10))) == LONGEST_REQUEST
     longest = ">0103105000325732327879303132333435363722\r\n"
     assert len(longest) == LONGEST_REPLY
-    for block in (INFO, FLAGS, ICMAX, READING, SERIAL):
-        assert 1 + 2 * (4 + 2 * block.words) + 2 <= LONGEST_REPLY
+    for registers in (INFO, FLAGS, ICMAX, READING, SERIAL):
+        assert 1 + 2 * (4 + 2 * registers.block.words) + 2 <= LONGEST_REPLY

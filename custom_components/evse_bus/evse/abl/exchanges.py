@@ -2,12 +2,12 @@
 
 from ..errors import ReplyTimeoutError
 from ..exchange import Talk
+from ..registers import Registers
 from ..safety import Setpoint
 from .registers import (
     CONFIGURATION_REGISTER,
     LIMIT_REGISTER,
     STATE_REGISTER,
-    Block,
     StateCode,
     read_answer,
     read_request,
@@ -18,19 +18,22 @@ from .registers import (
 )
 
 
-async def read(talk: Talk, address: int, block: Block, *, attempts: int = 1) -> bytes:
-    """Return the bytes of a block; raises what `Talk.exchange` raises.
+async def read[T](
+    talk: Talk, address: int, registers: Registers[T], *, attempts: int = 1
+) -> T:
+    """Return the contents of a block; raises what `Talk.exchange` raises.
 
     More than one attempt is for a box known to be awake: then a lost answer was a
     disturbance, and asking again at once helps.
     """
-    request = read_request(address, block)
+    request = read_request(address, registers.block)
+    answer = read_answer(address, registers.block)
     for _ in range(attempts - 1):
         try:
-            return await talk.exchange(request, read_answer(address, block))
+            return registers.decode(await talk.exchange(request, answer))
         except ReplyTimeoutError:
             continue
-    return await talk.exchange(request, read_answer(address, block))
+    return registers.decode(await talk.exchange(request, answer))
 
 
 async def set_limit(talk: Talk, address: int, setpoint: Setpoint) -> None:

@@ -43,11 +43,6 @@ from .registers import (
     Info,
     Reading,
     StateCode,
-    decode_flags,
-    decode_icmax,
-    decode_info,
-    decode_reading,
-    decode_serial,
     limit_duty,
 )
 from .states import E0
@@ -212,7 +207,7 @@ class AblReader(Charger):
         if self._identified and self._info is not None:
             return self._info
         address = self.config.address
-        info = decode_info(await read(talk, address, INFO))
+        info = await read(talk, address, INFO)
         serial = await self._read_serial(talk)
         expected = self.config.serial or self._serial
         if expected is not None and serial != expected:
@@ -235,14 +230,14 @@ class AblReader(Charger):
         expected, silence is taken for a register that is not there.
         """
         try:
-            data = await read(talk, self.config.address, SERIAL, attempts=2)
+            serial = await read(talk, self.config.address, SERIAL, attempts=2)
         except GarbledReplyError:
             raise
         except ReplyTimeoutError, ExchangeRefusedError:
             if self.config.serial is not None or self._serial is not None:
                 raise
             return None
-        return decode_serial(data)
+        return serial.number
 
     # -- What it says ------------------------------------------------------------
 
@@ -254,8 +249,7 @@ class AblReader(Charger):
 
     async def read_once(self, talk: Talk, *, attempts: int = 1) -> Reading:
         """Return what 0x002E tells; raises what `Talk.exchange` raises."""
-        data = await read(talk, self.config.address, READING, attempts=attempts)
-        return decode_reading(data)
+        return await read(talk, self.config.address, READING, attempts=attempts)
 
     def take(self, raw: Reading, now: float) -> None:
         """Make a reading of what was told."""
@@ -289,10 +283,10 @@ class AblReader(Charger):
     async def read_flags(self, talk: Talk) -> None:
         """Read the flags; without an answer the old ones count for a while."""
         try:
-            self._flags = decode_flags(await read(talk, self.config.address, FLAGS))
+            self._flags = await read(talk, self.config.address, FLAGS)
             if self.tells_icmax:
-                data = await read(talk, self.config.address, ICMAX)
-                self._icmax = decode_icmax(data)
+                icmax = await read(talk, self.config.address, ICMAX)
+                self._icmax = icmax.duty
         except ReplyTimeoutError, ExchangeRefusedError:
             self._flags_missed += 1
             if self._flags_missed >= FLAGS_MISSES:
@@ -310,11 +304,11 @@ class AblReader(Charger):
         # Silence is its answer for "no", and no miss.
         self.tells_icmax = False
         try:
-            data = await read(talk, self.config.address, ICMAX)
+            icmax = await read(talk, self.config.address, ICMAX)
         except ReplyTimeoutError, ExchangeRefusedError:
             return
         self.tells_icmax = True
-        self._icmax = decode_icmax(data)
+        self._icmax = icmax.duty
 
     # -- What is written -------------------------------------------------------------
 

@@ -1,17 +1,18 @@
-"""Registers of ABL EVCC2/3: encode and decode, pure functions.
+"""Registers of ABL EVCC2/3: decoding, requests and replies. Pure functions.
 
 Source: manual "EVCC2/3, API subset for external applications" (05 0015 20 Rev. B),
-chapter 2; PROTOCOLS.md, 2. A block is read whole; its first byte repeats the number
-of its first register. Bits are numbered as in the manual, over the whole block, the
-last register's bit 0 being 0.
+chapter 2, by the number of the first register; PROTOCOLS.md, 2. The first byte of a
+block repeats that number. Bits are numbered as in the manual: over the whole block,
+0 being the lowest bit of the last register.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final
+from typing import Final, override
 
 from ..errors import ExchangeRefusedError, RefusedOrderError
+from ..fields import Choice, Field, Number, Scaled, known
 from ..modbus import (
     READ_HOLDING_REGISTERS,
     WRITE_MULTIPLE_REGISTERS,
@@ -24,247 +25,158 @@ from ..modbus import (
     write_registers,
 )
 from ..model import Phases
+from ..registers import Block, Registers
 from ..safety import Setpoint
+from ..structs import bit, bits, phases, record
 from .duty import PAUSE, duty_for
 
 ADDRESSES: Final = range(1, 17)
-"""Valid device-IDs (1.2). 0 is the broadcast, to which nothing is ever sent."""
+"""Valid device-IDs (1.2). 0 is the broadcast, which is never used."""
 LONGEST_REPLY: Final = 43
-"""Bytes of the answer to a read of eight registers (1.4.1)."""
+"""Bytes of the reply to a read of eight registers (1.4.1)."""
 LONGEST_REQUEST: Final = 23
 """Bytes of the request that writes one register (1.4.2)."""
 
-
-@dataclass(frozen=True, slots=True)
-class Block:
-    """Registers that are read together."""
-
-    register: int
-    words: int
-    optional: bool = False
-    """Not in the manual; seen on real boxes. Others stay silent."""
-
-
-@dataclass(frozen=True, slots=True)
-class Bits:
-    """A field of a block, from its highest to its lowest bit."""
-
-    high: int
-    low: int
-
-    def of(self, block: int) -> int:
-        """Return the field's value."""
-        return block >> self.low & (1 << self.high - self.low + 1) - 1
-
-
-def _flag(bit: int) -> Bits:
-    return Bits(bit, bit)
-
-
-# -- 0x0001 (R2): device-ID, firmware, configuration -------------------------------
-
-INFO: Final = Block(0x0001, 2)
-_HARDWARE: Final = Bits(23, 22)  # which circuit board
-_DEVICE_ID: Final = Bits(21, 16)  # 1 to 16
-_MAJOR: Final = Bits(15, 12)
-_MINOR: Final = Bits(11, 8)
-_CODING_RESISTOR: Final = _flag(7)
-_UPSTREAM_TIMEOUT: Final = _flag(6)
-_METER: Final = _flag(5)
-_RDC_MD: Final = _flag(4)
-_SOCKET: Final = _flag(3)
-_WELDING_DETECTION: Final = _flag(2)
-_ENABLE_INPUT: Final = Bits(1, 0)
-
-_BOARDS: Final = ("pcba 141215", "pcba 160307", "pcba 170725", None)
-_ENABLE_INPUTS: Final = ("none", "closed_for_b2", "closed_for_enabled", "invalid")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Info:
-    """What a box is and how it is configured."""
-
-    hardware: str | None
-    """Circuit board."""
-    device_id: int
-    firmware: str
-    coding_resistor: bool
-    """The socket reads the rated current of the cable."""
-    upstream_timeout: bool
-    """Its own fail-safe: F4 or F14 when polling stops."""
-    meter: bool
-    """It measures phase currents."""
-    rdc_md: bool
-    """It detects DC residual current."""
-    socket: bool
-    """A socket, no attached cable."""
-    welding_detection: bool
-    enable_input: str
-    """What the enable input does: none, closed_for_b2, closed_for_enabled."""
-
-
-def decode_info(data: bytes) -> Info:
-    """Decode block `INFO`."""
-    block = int.from_bytes(data)
-    return Info(
-        hardware=_BOARDS[_HARDWARE.of(block)],
-        device_id=_DEVICE_ID.of(block),
-        firmware=f"{_MAJOR.of(block)}.{_MINOR.of(block)}",
-        coding_resistor=bool(_CODING_RESISTOR.of(block)),
-        upstream_timeout=bool(_UPSTREAM_TIMEOUT.of(block)),
-        meter=bool(_METER.of(block)),
-        rdc_md=bool(_RDC_MD.of(block)),
-        socket=bool(_SOCKET.of(block)),
-        welding_detection=bool(_WELDING_DETECTION.of(block)),
-        enable_input=_ENABLE_INPUTS[_ENABLE_INPUT.of(block)],
-    )
-
-
-# -- 0x0006 (R2): system flags -----------------------------------------------------
-
-FLAGS: Final = Block(0x0006, 2)
-_POINTER: Final = Bits(23, 16)
-_TRIGGERS_F4: Final = _flag(15)
-_NEEDS_ENABLE: Final = _flag(14)
-_CHINA: Final = Bits(13, 12)
-_UPSTREAM_LOST: Final = _flag(9)  # BC6
-_IMBALANCE: Final = _flag(8)  # BC3
-_HOT: Final = _flag(7)  # BC5
-_METER_FAILED: Final = _flag(6)  # BC4
-_E0_A1_DISABLED: Final = _flag(5)
-_B1_B2_DISABLED: Final = _flag(4)
-_A1_B1_DISABLED: Final = _flag(3)
-_OVERCURRENT: Final = Bits(2, 0)
-
+_BOARDS: Final = dict(enumerate(("pcba 141215", "pcba 160307", "pcba 170725", None)))
+_VERSIONS: Final = {raw: f"{raw >> 4}.{raw & 0xF}" for raw in range(0x100)}
+_ENABLE_INPUTS: Final = dict(
+    enumerate(("none", "closed_for_b2", "closed_for_enabled", "invalid"))
+)
+_CHINA: Final = {0b00: False, 0b01: False, 0b10: True, 0b11: False}
 _OVERCURRENTS: Final = {0b000: 0, 0b001: 100, 0b101: 105, 0b011: 110, 0b111: 120}
+_SETTINGS: Final = {0b11: None, 0b10: True, 0b01: False}
+
+HIGHEST_CURRENT: Final = 0x0320
+"""80 A in 0.1 A. Above: no current (0x03E8 by the manual, others are undefined)."""
+_CURRENT: Final = known(
+    Scaled(width=2, unit="A", divisor=10), range(HIGHEST_CURRENT + 1)
+)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+# -- Blocks that are read ----------------------------------------------------------
+
+
+@record
+class Info:
+    """Identity, firmware and configuration."""
+
+    hardware: str | None = bits(23, 22, Choice(values=_BOARDS))
+    """Circuit board."""
+    device_id: int = bits(21, 16, Number())
+    """1 to 16."""
+    firmware: str = bits(15, 8, Choice(values=_VERSIONS))
+    """Major and minor revision, such as ``1.2``."""
+    coding_resistor: bool = bit(7)
+    """The socket reads the rated current of the cable."""
+    upstream_timeout: bool = bit(6)
+    """The fail-safe of the box: F4 or F14 when polling stops."""
+    meter: bool = bit(5)
+    """It measures phase currents."""
+    rdc_md: bool = bit(4)
+    """It detects DC residual current."""
+    socket: bool = bit(3)
+    """A socket, no attached cable."""
+    welding_detection: bool = bit(2)
+    enable_input: str = bits(1, 0, Choice(values=_ENABLE_INPUTS))
+    """Function of the enable input: none, closed_for_b2, closed_for_enabled."""
+
+
+INFO: Final = Registers(Info, "0x0001", Block(0x0001, 2))
+
+
+@record
 class Flags:
     """System flags."""
 
-    pointer: int
+    pointer: int = bits(23, 16, Number())
     """Pointer of the state machine."""
-    triggers_f4: bool
+    triggers_f4: bool = bit(15)
     """The upstream time-out ends in F4, not F14."""
-    needs_enable: bool
+    needs_enable: bool = bit(14)
     """A plugged car must be enabled anew after a power cycle."""
-    china: bool
+    china: bool = bits(13, 12, Choice(values=_CHINA))
     """Limits for China."""
-    upstream_lost: bool
+    upstream_lost: bool = bit(9)
     """BC6"""
-    imbalance: bool
+    imbalance: bool = bit(8)
     """BC3"""
-    hot: bool
+    hot: bool = bit(7)
     """BC5: between 60 and 80 degrees Celsius on the board."""
-    meter_failed: bool
+    meter_failed: bool = bit(6)
     """BC4"""
-    e0_a1_disabled: bool
-    b1_b2_disabled: bool
-    a1_b1_disabled: bool
-    overcurrent: int | None
-    """The car takes more than this share of Ic, % (0: not more than Ic)."""
-
-
-def decode_flags(data: bytes) -> Flags:
-    """Decode block `FLAGS`."""
-    block = int.from_bytes(data)
-    return Flags(
-        pointer=_POINTER.of(block),
-        triggers_f4=bool(_TRIGGERS_F4.of(block)),
-        needs_enable=bool(_NEEDS_ENABLE.of(block)),
-        china=_CHINA.of(block) == 0b10,
-        upstream_lost=bool(_UPSTREAM_LOST.of(block)),
-        imbalance=bool(_IMBALANCE.of(block)),
-        hot=bool(_HOT.of(block)),
-        meter_failed=bool(_METER_FAILED.of(block)),
-        e0_a1_disabled=bool(_E0_A1_DISABLED.of(block)),
-        b1_b2_disabled=bool(_B1_B2_DISABLED.of(block)),
-        a1_b1_disabled=bool(_A1_B1_DISABLED.of(block)),
-        overcurrent=_OVERCURRENTS.get(_OVERCURRENT.of(block)),
+    e0_a1_disabled: bool = bit(5)
+    b1_b2_disabled: bool = bit(4)
+    a1_b1_disabled: bool = bit(3)
+    overcurrent: int | None = bits(
+        2, 0, known(Choice(values=_OVERCURRENTS, unit="%"), _OVERCURRENTS)
     )
+    """The car draws more than this share of Ic, % (0: not more than Ic)."""
 
 
-# -- 0x000F (R5), field: Icmax in the lower 12 bits of the fourth word -------------
-
-ICMAX: Final = Block(0x000F, 5, optional=True)
-_ICMAX_DUTY: Final = Bits(27, 16)  # 0.1 %
+FLAGS: Final = Registers(Flags, "0x0006", Block(0x0006, 2))
 
 
-def decode_icmax(data: bytes) -> int:
-    """Decode block `ICMAX`: the duty cycle Icmax, 0.1 %."""
-    return _ICMAX_DUTY.of(int.from_bytes(data))
+@record
+class Icmax:
+    """Highest duty cycle that the box offers."""
+
+    duty: int = bits(27, 16, Number(unit="0.1 %"))
+    """0.1 %"""
 
 
-# -- 0x002E (R5): state, inputs, Ic, phase currents --------------------------------
-
-READING: Final = Block(0x002E, 5)
-_STATE: Final = Bits(71, 64)
-_PLUGGED: Final = _flag(63)
-_REDUCED: Final = _flag(62)
-_EN2: Final = _flag(61)
-_EN1: Final = _flag(60)
-_IC: Final = Bits(59, 48)  # 0.1 %
-_PHASES: Final = (Bits(47, 32), Bits(31, 16), Bits(15, 0))  # 0.1 A
-
-HIGHEST_CURRENT: Final = 0x0320
-"""80 A. Above: no current (0x03E8 says so, other values say nothing at all)."""
+ICMAX: Final = Registers(Icmax, "PROTOCOLS.md, 2: 0x000F", Block(0x000F, 5))
+"""Not in the manual; only some boxes answer."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record
 class Reading:
     """State, inputs, duty cycle Ic and phase currents."""
 
-    state: int
+    state: int = bits(71, 64, Number())
     """State byte, see `states`."""
-    plugged: bool
-    """The pilot is at 10 V or below; means nothing in Ex and Fx."""
-    reduced: bool
+    plugged: bool = bit(63)
+    """The pilot is at 10 V or below; undefined in Ex and Fx."""
+    reduced: bool = bit(62)
     """Ic is reduced because of BC3 to BC6."""
-    en1: bool
-    """Input EN1 is closed."""
-    en2: bool
+    en2: bool = bit(61)
     """Input EN2 is closed."""
-    duty: int
+    en1: bool = bit(60)
+    """Input EN1 is closed."""
+    duty: int = bits(59, 48, Number(unit="0.1 %"))
     """Ic, 0.1 %."""
-    currents: Phases[float | None]
-    """Ict1 to Ict3, A; ``None``: the meter tells none."""
+    currents: Phases[float | None] = bits(47, 0, phases(_CURRENT))
+    """Ict1 to Ict3, A; ``None``: no measurement."""
 
 
-def decode_reading(data: bytes) -> Reading:
-    """Decode block `READING`."""
-    block = int.from_bytes(data)
-    one, two, three = (_current(field.of(block)) for field in _PHASES)
-    return Reading(
-        state=_STATE.of(block),
-        plugged=bool(_PLUGGED.of(block)),
-        reduced=bool(_REDUCED.of(block)),
-        en1=bool(_EN1.of(block)),
-        en2=bool(_EN2.of(block)),
-        duty=_IC.of(block),
-        currents=(one, two, three),
-    )
+READING: Final = Registers(Reading, "0x002E", Block(0x002E, 5))
 
 
-def _current(raw: int) -> float | None:
-    return raw / 10 if raw <= HIGHEST_CURRENT else None
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _SerialNumber(Field[str | None]):
+    """An ASCII text with zeros, spaces or erased bytes behind it."""
+
+    @override
+    def decode(self, data: bytes) -> str | None:
+        text = data.rstrip(b"\x00\xff ").decode("latin-1")
+        return text if text and text.isascii() and text.isprintable() else None
+
+    @override
+    def encode(self, value: object) -> bytes:
+        raise self.refused("cannot be written")
 
 
-# -- 0x0050 (R8): serial number (1.4.1) --------------------------------------------
+@record
+class Serial:
+    """Serial number (1.4.1)."""
 
-SERIAL: Final = Block(0x0050, 8)
-
-
-def decode_serial(data: bytes) -> str | None:
-    """Decode block `SERIAL`: 14 signs after its number and a zero byte.
-
-    ``None`` when it holds no readable serial number.
-    """
-    text = data[2:].rstrip(b"\x00\xff ").decode("latin-1")
-    return text if text and text.isascii() and text.isprintable() else None
+    number: str | None = bits(111, 0, _SerialNumber(width=14))
+    """Up to 14 characters; ``None``: not readable."""
 
 
-# -- Reading and writing -----------------------------------------------------------
+SERIAL: Final = Registers(Serial, "1.4.1: 0x0050", Block(0x0050, 8))
+
+
+# -- Requests and replies ----------------------------------------------------------
 
 
 def read_request(address: int, block: Block) -> bytes:
@@ -273,21 +185,24 @@ def read_request(address: int, block: Block) -> bytes:
 
 
 def read_answer(address: int, block: Block) -> Callable[[ModbusFrame], bytes | None]:
-    """Return what knows the answer to `read_request` and gives its bytes."""
+    """Return a matcher for the reply to `read_request` that returns the block's bytes.
+
+    It raises ExchangeRefusedError for an exception.
+    """
 
     def accept(frame: ModbusFrame) -> bytes | None:
         if not frame.is_reply or frame.unit != address:
             return None
         _raise_if_refused(frame, READ_HOLDING_REGISTERS)
         data = registers_read(frame, block.words)
-        # The register's number in front catches the answer to another request.
+        # The register's number in front catches the reply to another request.
         return data if data is not None and data[0] == block.register else None
 
     return accept
 
 
 class StateCode(IntEnum):
-    """What register 0x0005 takes."""
+    """Values of register 0x0005."""
 
     RESET = 0x5A5A
     A1 = 0xA1A1
@@ -299,9 +214,22 @@ STATE_REGISTER: Final = 0x0005
 LIMIT_REGISTER: Final = 0x0014
 CONFIGURATION_REGISTER: Final = 0x002C
 
-_ON: Final = 0b10
-_OFF: Final = 0b01
-_NO_CHANGE: Final = 0b11
+
+@record
+class Configuration:
+    """Device-ID and settings; ``None``: no change."""
+
+    upstream_timeout: bool | None = bits(15, 14, Choice(values=_SETTINGS))
+    """The upstream time-out and F4 are enabled."""
+    needs_enable: bool | None = bits(13, 12, Choice(values=_SETTINGS))
+    """A plugged car stops in B1 after a power cycle and must be enabled."""
+    device_id: int = bits(7, 0, Number(valid=ADDRESSES))
+
+
+CONFIGURATION: Final = Registers(
+    Configuration, "0x002C", Block(CONFIGURATION_REGISTER, 1)
+)
+"""Only written."""
 
 
 def limit_duty(setpoint: Setpoint) -> int:
@@ -315,7 +243,7 @@ def write_limit(address: int, setpoint: Setpoint) -> bytes:
 
 
 def write_state(address: int, code: StateCode) -> bytes:
-    """Return the frame that makes the outlet change its state (0x0005)."""
+    """Return the frame that changes the state of the outlet (0x0005)."""
     return _write(address, STATE_REGISTER, code)
 
 
@@ -326,21 +254,21 @@ def write_configuration(
     upstream_timeout: bool | None = None,
     needs_enable: bool | None = None,
 ) -> bytes:
-    """Return the frame that sets device-ID and settings (0x002C, in state E2).
+    """Return the frame that writes a `Configuration` (in state E2).
 
-    Bits 15..14 are the upstream time-out, 13..12 whether a plugged car needs to be
-    enabled after a power cycle; ``None``: no change.
+    Raises RefusedOrderError for an invalid device-ID.
     """
-    value = (
-        _setting(upstream_timeout) << 14
-        | _setting(needs_enable) << 12
-        | _checked(device_id)
+    configuration = Configuration(
+        upstream_timeout=upstream_timeout,
+        needs_enable=needs_enable,
+        device_id=device_id,
     )
+    value = int.from_bytes(CONFIGURATION.encode(configuration))
     return _write(address, CONFIGURATION_REGISTER, value)
 
 
 def write_answer(address: int, register: int) -> Callable[[ModbusFrame], bool | None]:
-    """Return what knows the confirmation of a write.
+    """Return a matcher for the confirmation of a write.
 
     It raises ExchangeRefusedError when the box refuses (function 0x90, 1.4.3).
     """
@@ -352,10 +280,6 @@ def write_answer(address: int, register: int) -> Callable[[ModbusFrame], bool | 
         return True if is_written(frame, register, 1) else None
 
     return accept
-
-
-def _setting(value: bool | None) -> int:  # noqa: FBT001
-    return _NO_CHANGE if value is None else _ON if value else _OFF
 
 
 def _write(address: int, register: int, value: int) -> bytes:

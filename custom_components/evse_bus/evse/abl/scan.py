@@ -20,8 +20,6 @@ from .registers import (
     ADDRESSES,
     INFO,
     SERIAL,
-    decode_info,
-    decode_serial,
     read_answer,
     read_request,
 )
@@ -113,7 +111,7 @@ async def _ask_info(address: int, talk: Talk) -> ChargerInfo:
     Two equal boxes may answer this as one; their serial numbers differ, so that
     answer is then unreadable, or there are two. Raises GarbledReplyError for both.
     """
-    info = decode_info(await read(talk, address, INFO))
+    info = await read(talk, address, INFO)
     serials = await _listen_for_serials(talk, address)
     if len(serials) > 1:
         message = f"device-ID {address} has {len(serials)} serial numbers"
@@ -128,16 +126,16 @@ async def _listen_for_serials(talk: Talk, address: int) -> set[str | None]:
     than the first one is heard as well.
     """
     serials: set[str | None] = set()
-    answer = read_answer(address, SERIAL)
+    answer = read_answer(address, SERIAL.block)
 
     def collect(frame: ModbusFrame) -> None:
         if (data := answer(frame)) is not None:
-            serials.add(decode_serial(data))
+            serials.add(SERIAL.decode(data).number)
 
     garbled: GarbledReplyError | None = None
     for _ in range(ASKED):
         try:
-            await talk.exchange(read_request(address, SERIAL), collect)
+            await talk.exchange(read_request(address, SERIAL.block), collect)
         except GarbledReplyError as error:
             garbled = error
         except ReplyTimeoutError:

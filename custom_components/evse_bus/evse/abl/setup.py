@@ -20,7 +20,7 @@ from ..turns import rest
 from .dialogue import BOOT_LOOKS, Dialogue
 from .exchanges import configure, read
 from .reader import Debt
-from .registers import INFO, SERIAL, Reading, StateCode, decode_serial
+from .registers import INFO, SERIAL, Reading, StateCode
 from .states import A1, E0, E2
 
 
@@ -132,8 +132,8 @@ class SetUp(Dialogue):
             await rest(self.pauses.boot)
             self._hold_polls(talk)
             with suppress(ReplyTimeoutError):
-                found = decode_serial(await read(talk, new, SERIAL))
-                if found == serial:
+                found = await read(talk, new, SERIAL)
+                if found.number == serial:
                     charger.config = replace(charger.config, address=new)
                     return
         message = (
