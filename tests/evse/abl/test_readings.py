@@ -9,7 +9,7 @@ import pytest
 
 from custom_components.evse_bus.evse.abl.readings import (
     EnergyEstimate,
-    Told,
+    Snapshot,
     charger_info,
     charger_reading,
     phase_currents,
@@ -43,7 +43,7 @@ FULL = Reading(
 NONE_TOLD = (None, None, None)
 
 
-def told(
+def snapshot(
     state: int = 0xC2,
     *,
     duty: int = 266,
@@ -52,7 +52,7 @@ def told(
     plugged: bool = True,
     meter: bool = True,
     flags: Flags | None = CLEAR,
-) -> Told:
+) -> Snapshot:
     reading = replace(
         FULL,
         state=state,
@@ -62,16 +62,16 @@ def told(
         plugged=plugged,
     )
     info = WITH_METER if meter else WITHOUT_METER
-    return Told(reading=reading, info=info, flags=flags)
+    return Snapshot(reading=reading, info=info, flags=flags)
 
 
-def read(what: Told) -> tuple[ChargerReading, ConnectorReading]:
+def read(what: Snapshot) -> tuple[ChargerReading, ConnectorReading]:
     reading = charger_reading(what, phase_currents(what, (1, 2, 3)), None, None)
     return reading, reading.connectors[1]
 
 
 def test_charging() -> None:
-    reading, connector = read(told())
+    reading, connector = read(snapshot())
     assert (connector.status, connector.raw_state) == (Status.CHARGING, "C2")
     assert (connector.plugged, connector.charging) == (True, True)
     assert connector.current == (10.0, 9.9, 0.0)
@@ -107,7 +107,7 @@ def test_status_and_permission(
     allowed: bool | None,  # noqa: FBT001
     offered: float | None,
 ) -> None:
-    reading, connector = read(told(state, duty=duty))
+    reading, connector = read(snapshot(state, duty=duty))
     assert connector.status is status
     assert reading.allowed is allowed
     assert reading.offered_current == offered
@@ -121,37 +121,37 @@ def test_a_plug_is_told_only_where_its_bit_counts(
     state: int,
     expected: bool | None,  # noqa: FBT001
 ) -> None:
-    assert read(told(state))[1].plugged is expected
-    unplugged = read(told(state, plugged=False))[1].plugged
+    assert read(snapshot(state))[1].plugged is expected
+    unplugged = read(snapshot(state, plugged=False))[1].plugged
     assert unplugged is (None if expected is None else False)
 
 
 @pytest.mark.parametrize("state", [0xA1, 0xB1, 0xB2, 0xE0])
 def test_no_value_is_zero_where_the_contactor_is_open(state: int) -> None:
-    what = told(state, currents=NONE_TOLD)
+    what = snapshot(state, currents=NONE_TOLD)
     assert read(what)[1].current == (0, 0, 0)
 
 
 @pytest.mark.parametrize(
     "what",
     [
-        pytest.param(told(0xC2, currents=NONE_TOLD), id="charging"),
-        pytest.param(told(0xC3, currents=NONE_TOLD), id="charging, reduced"),
-        pytest.param(told(0xF1, currents=NONE_TOLD), id="welded"),
-        pytest.param(told(0xA1, currents=NONE_TOLD, meter=False), id="no meter"),
-        pytest.param(told(0xA1, meter=False), id="values without a meter"),
-        pytest.param(told(0xA1, currents=NONE_TOLD, flags=None), id="no flags"),
+        pytest.param(snapshot(0xC2, currents=NONE_TOLD), id="charging"),
+        pytest.param(snapshot(0xC3, currents=NONE_TOLD), id="charging, reduced"),
+        pytest.param(snapshot(0xF1, currents=NONE_TOLD), id="welded"),
+        pytest.param(snapshot(0xA1, currents=NONE_TOLD, meter=False), id="no meter"),
+        pytest.param(snapshot(0xA1, meter=False), id="values without a meter"),
+        pytest.param(snapshot(0xA1, currents=NONE_TOLD, flags=None), id="no flags"),
         pytest.param(
-            told(0xA1, flags=replace(CLEAR, meter_failed=True)), id="meter failed"
+            snapshot(0xA1, flags=replace(CLEAR, meter_failed=True)), id="meter failed"
         ),
     ],
 )
-def test_no_value_is_unknown_elsewhere(what: Told) -> None:
+def test_no_value_is_unknown_elsewhere(what: Snapshot) -> None:
     assert read(what)[1].current == UNKNOWN_PHASES
 
 
 def test_phase_order() -> None:
-    what = told(currents=(1.0, 2.0, 3.0))
+    what = snapshot(currents=(1.0, 2.0, 3.0))
     assert phase_currents(what, (1, 2, 3)) == (1, 2, 3)
     # Ict1 measures L3, Ict2 L1, Ict3 L2.
     assert phase_currents(what, (3, 1, 2)) == (2, 3, 1)
@@ -161,17 +161,17 @@ def test_phase_order() -> None:
 @pytest.mark.parametrize(
     ("what", "faults", "codes"),
     [
-        (told(0xF9), {Fault.OVERCURRENT}, ("F9",)),
-        (told(0xFB), {Fault.CONTACTOR_OPEN}, ("F11",)),
-        (told(0xF0), {Fault.UNKNOWN}, ("0xF0",)),
-        (told(0xC3), set(), ()),
-        (told(0xC3, reduced=True), {Fault.REDUCED_CURRENT}, ("F16/F17",)),
-        (told(0xB2, reduced=True), {Fault.REDUCED_CURRENT}, ("BC3-BC6",)),
-        (told(0xC4), {Fault.LOAD_IMBALANCE}, ("F15",)),
-        (told(flags=None), set(), ()),
+        (snapshot(0xF9), {Fault.OVERCURRENT}, ("F9",)),
+        (snapshot(0xFB), {Fault.CONTACTOR_OPEN}, ("F11",)),
+        (snapshot(0xF0), {Fault.UNKNOWN}, ("0xF0",)),
+        (snapshot(0xC3), set(), ()),
+        (snapshot(0xC3, reduced=True), {Fault.REDUCED_CURRENT}, ("F16/F17",)),
+        (snapshot(0xB2, reduced=True), {Fault.REDUCED_CURRENT}, ("BC3-BC6",)),
+        (snapshot(0xC4), {Fault.LOAD_IMBALANCE}, ("F15",)),
+        (snapshot(flags=None), set(), ()),
     ],
 )
-def test_faults(what: Told, faults: set[Fault], codes: tuple[str, ...]) -> None:
+def test_faults(what: Snapshot, faults: set[Fault], codes: tuple[str, ...]) -> None:
     reading, _ = read(what)
     assert reading.faults == faults
     assert reading.fault_codes == codes
@@ -190,13 +190,13 @@ def test_faults(what: Told, faults: set[Fault], codes: tuple[str, ...]) -> None:
     ],
 )
 def test_faults_in_flags(bits: int, fault: Fault, code: str) -> None:
-    reading, _ = read(told(flags=FLAGS.decode(b"\x06\x00" + bits.to_bytes(2))))
+    reading, _ = read(snapshot(flags=FLAGS.decode(b"\x06\x00" + bits.to_bytes(2))))
     assert reading.faults == {fault}
     assert reading.fault_codes == (code,)
 
 
 def test_five_percent_too_much_is_no_fault() -> None:
-    assert not read(told(flags=FLAGS.decode(b"\x06\x00\x00\x01")))[0].faults
+    assert not read(snapshot(flags=FLAGS.decode(b"\x06\x00\x00\x01")))[0].faults
 
 
 def test_info() -> None:
@@ -253,7 +253,7 @@ def test_energy_never_falls(steps: list[tuple[float | None, float]]) -> None:
 def test_any_registers_make_a_reading(
     reading: bytes, info: bytes, flags: bytes | None, order: list[int]
 ) -> None:
-    what = Told(
+    what = Snapshot(
         reading=READING.decode(b"\x2e" + reading),
         info=INFO.decode(b"\x01" + info),
         flags=None if flags is None else FLAGS.decode(b"\x06" + flags),

@@ -1,21 +1,21 @@
-"""Ampere and duty cycle of the control pilot, in the register's unit of 0.1 %.
+"""Conversion between current and duty cycle of the control pilot (0.1 %).
 
 Source: ABL EVCC2/3 manual, annex 3.2 (IEC 61851-1, annex A); PROTOCOLS.md, 2:
 
 =============  ======================  =====================================
 duty cycle     current                 remark
 =============  ======================  =====================================
-0 %            none can be said        pilot at -12 V, not available
-5 %            none can be said        told by digital communication
-8 to 10 %      6 A                     register 0x0014 takes 8 % and more
+0 %            unknown                 pilot at -12 V, not available
+5 %            unknown                 set by digital communication
+8 to 10 %      6 A                     register 0x0014 accepts 8 % and more
 10 to 85 %     0.6 A for each percent  6 to 51 A
 85 to 96 %     2.5 A x (percent - 64)  52.5 to 80 A
-96 to 97 %     80 A                    how IEC 61851-1 has a car read it
-100 %          0 A                     no current allowed: the real pause
+96 to 97 %     80 A                    as a car decodes it (IEC 61851-1)
+100 %          0 A                     no current allowed: the pause
 =============  ======================  =====================================
 
-Anything else says no current. The branches do not meet: a wish above 51 A and
-below 52.5 A has no code of its own and becomes 51 A.
+Any other duty cycle has no current. The branches do not meet: a current above 51 A
+and below 52.5 A has no code of its own and becomes 51 A.
 """
 
 from decimal import ROUND_FLOOR, Decimal
@@ -25,7 +25,7 @@ from ..errors import RefusedOrderError
 from ..model import MAXIMUM_CURRENT, MINIMUM_CURRENT
 
 PAUSE: Final = 0x3E8
-"""100 %: no current allowed, and the cable is still seen."""
+"""100 %: no current allowed; a plugged cable is still detected."""
 
 _LOWEST: Final = 80
 _MINIMUM: Final = 100
@@ -53,7 +53,7 @@ def duty_for(current: float) -> int:
 
 
 def current_for(duty: int) -> float | None:
-    """Return the current (A) that a duty cycle (0.1 %) offers; ``None``: not told."""
+    """Return the current (A) that a duty cycle (0.1 %) offers; ``None``: unknown."""
     if duty == PAUSE:
         return 0.0
     if not _LOWEST <= duty <= _TOLERATED_END:
@@ -66,7 +66,7 @@ def current_for(duty: int) -> float | None:
 
 
 def is_within(duty: int, written: int) -> bool:
-    """Return whether a duty cycle read back is at or below the one written."""
+    """Return whether a duty cycle that was read is at or below the one written."""
     return duty == PAUSE or (written != PAUSE and duty <= written)
 
 

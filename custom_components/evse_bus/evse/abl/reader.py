@@ -25,7 +25,7 @@ from .duty import PAUSE, is_within
 from .exchanges import read, set_limit
 from .readings import (
     EnergyEstimate,
-    Told,
+    Snapshot,
     charger_info,
     charger_reading,
     phase_currents,
@@ -143,7 +143,7 @@ class AblReader(Charger):
     @override
     def set_up(self, config: ChargerConfig) -> None:
         super().set_up(config)
-        self._energy.expect(config.poll_interval)
+        self._energy.set_interval(config.poll_interval)
 
     @property
     @override
@@ -256,15 +256,17 @@ class AblReader(Charger):
         self.raw = raw
         if self._info is None:
             return
-        told = Told(reading=raw, info=self._info, flags=self._flags, icmax=self._icmax)
+        snapshot = Snapshot(
+            reading=raw, info=self._info, flags=self._flags, icmax=self._icmax
+        )
         order = (
             self.config.phase_order if isinstance(self.config, AblConfig) else (1, 2, 3)
         )
-        currents = phase_currents(told, order)
+        currents = phase_currents(snapshot, order)
         power = power_of(currents, self.config.voltage)
         self._energy.add(power, now)
         energy = self._energy.energy if self._info.meter else None
-        reading = charger_reading(told, currents, power, energy)
+        reading = charger_reading(snapshot, currents, power, energy)
         changed = reading != self.reading
         self.reading = reading
         if changed:

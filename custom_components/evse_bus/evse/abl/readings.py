@@ -1,4 +1,4 @@
-"""From what a box told to the neutral model, and the estimates beside it."""
+"""Conversion of register contents to the neutral model, with estimates."""
 
 from dataclasses import dataclass
 
@@ -9,27 +9,27 @@ from .registers import Flags, Info, Reading
 from .states import B1, B2, C3, C4, state_of
 
 SHORTEST_GAP = 10.0
-"""Pause between two readings over which energy is always summed, s."""
+"""Energy is always summed between two readings up to this far apart, s."""
 GAP_INTERVALS = 3.0
-"""Poll intervals over which energy is summed at most."""
+"""Else energy is summed over at most so many poll intervals."""
 TOLERATED = 100
-"""Above 100 % up to 105 % of Ic nothing ever follows (0x0006, bits 2..0), %."""
+"""% of Ic: up to 105 % has no consequence in the box (0x0006, bits 2..0)."""
 _SECONDS_PER_HOUR = 3600.0
 _CODES = {C4: "F15"}
 _REDUCED_CODES = {C3: "F16/F17"}
-"""Errors that show as a state with another name (annex 3.4)."""
+"""Codes of errors that show as a state with another name (annex 3.4)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Told:
-    """All that a box told of itself up to now."""
+class Snapshot:
+    """Everything read from a box so far."""
 
     reading: Reading
     info: Info
     flags: Flags | None = None
     """``None``: not read yet, or too long ago."""
     icmax: int | None = None
-    """Duty cycle Icmax, 0.1 %; only some boxes tell it."""
+    """Duty cycle Icmax, 0.1 %; ``None`` on boxes without register 0x000F."""
 
 
 class EnergyEstimate:
@@ -41,14 +41,14 @@ class EnergyEstimate:
         """Wh"""
         self._longest = 0.0
         self._last: tuple[float, float] | None = None
-        self.expect(poll_interval)
+        self.set_interval(poll_interval)
 
-    def expect(self, poll_interval: float) -> None:
-        """Take what is much longer than this (s) between two readings for a gap."""
+    def set_interval(self, poll_interval: float) -> None:
+        """Set the time between readings (s); several times as long is a gap."""
         self._longest = max(GAP_INTERVALS * poll_interval, SHORTEST_GAP)
 
     def add(self, power: float | None, now: float) -> None:
-        """Take a power (W) at a time (s)."""
+        """Add a power (W) at a time (s)."""
         last, self._last = self._last, None if power is None else (now, power)
         if last is None or power is None:
             return
@@ -57,21 +57,23 @@ class EnergyEstimate:
             self.energy += (before + power) / 2 * (now - then) / _SECONDS_PER_HOUR
 
     def interrupt(self) -> None:
-        """Sum nothing over what comes between the last reading and the next."""
+        """Start a gap: nothing is summed until the next reading."""
         self._last = None
 
 
-def phase_currents(told: Told, order: Phases[int]) -> Phases[float | None]:
+def phase_currents(snapshot: Snapshot, order: Phases[int]) -> Phases[float | None]:
     """Return the currents of L1, L2 and L3, A.
 
-    ``order`` says which phase each of Ict1 to Ict3 measures. A missing value is a
-    measured 0 only where the state itself says that the contactor is open, on a box
-    with a working meter (PROTOCOLS.md, 2); else it is unknown.
+    ``order``: the phase that each of Ict1 to Ict3 measures. A missing value is 0 A
+    only in a state with an open contactor on a box with a working meter
+    (PROTOCOLS.md, 2); else it is unknown.
     """
-    if not told.info.meter or (told.flags is not None and told.flags.meter_failed):
+    if not snapshot.info.meter or (
+        snapshot.flags is not None and snapshot.flags.meter_failed
+    ):
         return UNKNOWN_PHASES
-    zero = state_of(told.reading.state).no_current and told.flags is not None
-    by_phase = dict(zip(order, told.reading.currents, strict=True))
+    zero = state_of(snapshot.reading.state).no_current and snapshot.flags is not None
+    by_phase = dict(zip(order, snapshot.reading.currents, strict=True))
     one, two, three = (
         0.0 if by_phase[phase] is None and zero else by_phase[phase]
         for phase in (1, 2, 3)
@@ -80,23 +82,23 @@ def phase_currents(told: Told, order: Phases[int]) -> Phases[float | None]:
 
 
 def power_of(currents: Phases[float | None], voltage: float) -> float | None:
-    """Return the estimated power of three currents at one voltage, W."""
+    """Return the estimated power of three currents at a voltage, W; ``None``: unknown."""
     known = [current for current in currents if current is not None]
     return round(sum(known) * voltage, 1) if len(known) == len(currents) else None
 
 
 def charger_reading(
-    told: Told,
+    snapshot: Snapshot,
     currents: Phases[float | None],
     power: float | None,
     energy: float | None,
 ) -> ChargerReading:
-    """Return what a box told, in the words of the model."""
-    reading = told.reading
+    """Return the reading; power (W) and energy (Wh) are estimates."""
+    reading = snapshot.reading
     state = state_of(reading.state)
     paused = reading.duty == PAUSE
     offered = current_for(reading.duty)
-    faults, codes = faults_of(told)
+    faults, codes = faults_of(snapshot)
     connector = ConnectorReading(
         status=(
             Status.SUSPENDED_EVSE
@@ -113,32 +115,32 @@ def charger_reading(
     return ChargerReading(
         connectors={1: connector},
         allowed=_allowed(outlet_enabled=state.outlet_enabled, offered=offered),
-        # In Ex and Fx the box still tells a duty cycle, and offers nothing.
+        # In Ex and Fx the duty cycle has a value, but nothing is offered.
         offered_current=offered if state.outlet_enabled else None,
         outlet_enabled=state.outlet_enabled,
         faults=faults,
         fault_codes=codes,
-        details=_details(told),
+        details=_details(snapshot),
     )
 
 
 def _allowed(*, outlet_enabled: bool | None, offered: float | None) -> bool | None:
-    """Return whether a car may charge: neither E0 nor 100 %, if that can be said."""
+    """Return whether a car may charge (neither E0 nor 100 %); ``None``: unknown."""
     if outlet_enabled is not True:
         return outlet_enabled
     return None if offered is None else offered > 0
 
 
-def faults_of(told: Told) -> tuple[frozenset[Fault], tuple[str, ...]]:
-    """Return the named faults and the box's own codes for them."""
-    state = state_of(told.reading.state)
+def faults_of(snapshot: Snapshot) -> tuple[frozenset[Fault], tuple[str, ...]]:
+    """Return the faults and the manual's codes for them."""
+    state = state_of(snapshot.reading.state)
     found: list[tuple[Fault, str]] = []
     if state.fault is not None:
-        found.append((state.fault, _CODES.get(told.reading.state, state.name)))
-    if told.reading.reduced:
-        code = _REDUCED_CODES.get(told.reading.state, "BC3-BC6")
+        found.append((state.fault, _CODES.get(snapshot.reading.state, state.name)))
+    if snapshot.reading.reduced:
+        code = _REDUCED_CODES.get(snapshot.reading.state, "BC3-BC6")
         found.append((Fault.REDUCED_CURRENT, code))
-    if (flags := told.flags) is not None:
+    if (flags := snapshot.flags) is not None:
         found.extend(
             (fault, code)
             for present, fault, code in (
@@ -153,16 +155,16 @@ def faults_of(told: Told) -> tuple[frozenset[Fault], tuple[str, ...]]:
     return frozenset(fault for fault, _ in found), tuple(code for _, code in found)
 
 
-def _details(told: Told) -> dict[str, str | int | float | bool | None]:
-    reading = told.reading
+def _details(snapshot: Snapshot) -> dict[str, str | int | float | bool | None]:
+    reading = snapshot.reading
     details: dict[str, str | int | float | bool | None] = {
         "ic_duty": reading.duty / 10,
-        "icmax_duty": None if told.icmax is None else told.icmax / 10,
+        "icmax_duty": None if snapshot.icmax is None else snapshot.icmax / 10,
         "reduced": reading.reduced,
         "en1": reading.en1,
         "en2": reading.en2,
     }
-    if (flags := told.flags) is not None:
+    if (flags := snapshot.flags) is not None:
         details |= {
             "state_pointer": flags.pointer,
             "a1_b1_enabled": not flags.a1_b1_disabled,
@@ -174,7 +176,7 @@ def _details(told: Told) -> dict[str, str | int | float | bool | None]:
 
 
 def charger_info(info: Info, serial: str | None, flags: Flags | None) -> ChargerInfo:
-    """Return what a box is."""
+    """Return identity and options of a box; ``flags`` adds more options."""
     options: dict[str, str | int | bool | None] = {
         "coding_resistor": info.coding_resistor,
         "upstream_timeout": info.upstream_timeout,
