@@ -65,7 +65,7 @@ class House:
 
     async def share(self, amps: float) -> None:
         """Let the chargers share so much."""
-        duty = self.bus.duty
+        duty = self.bus.master
         if duty is not None:
             self.shared.append(Shared(asyncio.get_running_loop().time(), amps))
             await duty.change_supply(Supply(limit=amps))

@@ -127,8 +127,8 @@ async def _plan(bus: Bus) -> float:
     """Return when a broadcast is due, as soon as there are any."""
     async with asyncio.timeout(10.0):
         while True:
-            if bus.duty is not None and bus.duty.slot.start_by < inf:
-                return bus.duty.slot.start_by - SLACK
+            if bus.master is not None and bus.master.slot.start_by < inf:
+                return bus.master.slot.start_by - SLACK
             await asyncio.sleep(0.1)
 
 
@@ -245,8 +245,8 @@ async def _shares(bus: Bus, times: int) -> tuple[list[Called], list[Called]]:
     one, other = bus.chargers.values()
     for charger in (one, other):
         await charger.change_orders(OrderChange(current=HIGH))
-    if bus.duty is not None:
-        await bus.duty.change_supply(Supply(limit=HIGH + LOW))
+    if bus.master is not None:
+        await bus.master.change_supply(Supply(limit=HIGH + LOW))
     await asyncio.sleep(FOLLOWED)
     freed: list[Called] = []
     given_back: list[Called] = []

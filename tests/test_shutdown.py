@@ -189,7 +189,7 @@ async def test_a_mistake_of_ours_holds_nothing_up(
     farewell: Callable[..., Awaitable[None]],
     said: str,
 ) -> None:
-    monkeypatch.setattr(PolledSmartEvse, "farewell", farewell)
+    monkeypatch.setattr(PolledSmartEvse, "on_shutdown", farewell)
     async with running(hass, SmartEvse()) as (entry, bus):
         await get_entity(hass, "sensor", entry, "1_status")
         async with asyncio.timeout(5):

@@ -141,7 +141,7 @@ async def test_search_beside_another_master(hass: HomeAssistant) -> None:
         await bus.wait_for_async(lambda: first.broadcasts)
         bus.add(SmartEvse(load_balance=1))
         flow = await Flow.add_charger(hass, entry)
-        duty = entry.runtime_data.bus.duty
+        duty = entry.runtime_data.bus.master
         # Once the two did not speak at the same time.
         await bus.wait_for_async(lambda: duty.noticed, timeout=15)
         await flow.choose("scan")
@@ -321,7 +321,7 @@ async def test_shared_supply_is_changed_while_the_slaves_hear_their_master(
             "supply_minimum": 8,
         }
         assert entry.state is ConfigEntryState.LOADED
-        supply = entry.runtime_data.bus.duty.supply
+        supply = entry.runtime_data.bus.master.supply
         assert (supply.limit, supply.minimum) == (9, 8)
         assert bus.opened == 1
         await take_down(hass, entry)

@@ -22,7 +22,7 @@ from .entity import (
     supported,
 )
 from .evse.bus import Bus
-from .evse.duty import Duty
+from .evse.master import BusMaster
 from .evse.model import Capability, Fault
 from .evse.readings import ChargerReading, ConnectorReading
 from .managed_charger import ManagedCharger
@@ -154,7 +154,7 @@ async def async_setup_entry(
     coordinator = entry.runtime_data
     if coordinator.bus is not None:
         async_add_entities([ConnectedSensor(coordinator, coordinator.bus)])
-    if (duty := coordinator.connections.duty) is not None:
+    if (duty := coordinator.connections.master) is not None:
         async_add_entities([SecondMasterSensor(coordinator, duty)])
     add_charger_entities(
         Platform.BINARY_SENSOR, entry, async_add_entities, _sensors, _obsolete
@@ -240,7 +240,7 @@ class BoxBinarySensor(ChargerEntity, BinarySensorEntity):
 class SecondMasterSensor(BusEntity, BinarySensorEntity):
     """Whether somebody else also plays the master, so that we keep silent."""
 
-    def __init__(self, coordinator: BusCoordinator, duty: Duty) -> None:
+    def __init__(self, coordinator: BusCoordinator, duty: BusMaster) -> None:
         """Belong to the bus."""
         super().__init__(coordinator, SECOND_MASTER)
         self._duty = duty

@@ -27,9 +27,9 @@ from .const import (
 )
 from .coordinator import EvseBusConfigEntry
 from .evse.errors import RefusedOrderError
-from .evse.found import ScanReport
 from .evse.protocol import Progress, Protocol
 from .evse.protocols import PROTOCOLS
+from .evse.scan import ScanResult
 from .flows.address import ADDRESSES, Errors, typed_addresses
 from .flows.charger import CONF_EXPERT, short_name
 from .flows.listener import ListenerOptionsFlow, ListenerSteps
@@ -167,10 +167,10 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
         if user_input is not None:
             errors = await self._async_check_port(self.protocol, user_input)
             if not errors:
-                if self.protocol.probe_imposes:
+                if self.protocol.probe_sets_limits:
                     return await self.async_step_impose()
                 self._searches = nothing_imposed(self.protocol)
-                if self.protocol.duty is not None:
+                if self.protocol.master is not None:
                     return await self.async_step_supply()
                 return await self.async_step_scan()
         usual = self.protocol.settings
@@ -306,11 +306,11 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
     @override
     def choices(self) -> tuple[str, ...]:
         """Return where one can go when a search brought nothing to add."""
-        other_values = ("impose",) if self.protocol.probe_imposes else ()
+        other_values = ("impose",) if self.protocol.probe_sets_limits else ()
         return ("scan", *other_values, "manual", "port")
 
     @override
-    async def async_scan(self, progress: Progress) -> ScanReport:
+    async def async_scan(self, progress: Progress) -> ScanResult:
         """Open the port for a search, and close it again whatever happens."""
         bus = self.protocol.bus(
             self.bus_data[CONF_DEVICE], settings=line_settings(self.bus_data)
@@ -332,7 +332,7 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
             title=_title(self.bus_data), data=self.bus_data, subentries=chargers
         )
 
-    # -- Later -------------------------------------------------------------------
+    # -- FollowUp -------------------------------------------------------------------
 
     async def async_step_reconfigure(
         self, user_input: dict[str, Any] | None = None

@@ -108,7 +108,7 @@ def rebuild_data(data: Mapping[str, Any]) -> dict[str, Any]:
 
 def supply_of(data: Mapping[str, Any]) -> Supply | None:
     """Return the supply that the chargers share; ``None``: they share none."""
-    if protocol_of(data).duty is None:
+    if protocol_of(data).master is None:
         return None
     return Supply(
         limit=float(data.get(CONF_SUPPLY_LIMIT, MINIMUM_CURRENT)),

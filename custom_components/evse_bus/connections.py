@@ -16,8 +16,8 @@ from homeassistant.const import CONF_DEVICE, CONF_HOST, CONF_PORT
 from .configuration import line_settings, protocol_of, supply_of
 from .const import CONF_ALLOWED
 from .evse.bus import Bus
-from .evse.duty import Duty
 from .evse.ews import Listener, Stranger
+from .evse.master import BusMaster
 from .evse.model import ChargerConfig
 
 
@@ -33,9 +33,9 @@ class Connections(ABC):
         """Return the bus of all chargers; ``None``: each box has its own."""
 
     @property
-    def duty(self) -> Duty | None:
+    def master(self) -> BusMaster | None:
         """Return the master of the shared bus, if the protocol has one."""
-        return None if self.shared_bus is None else self.shared_bus.duty
+        return None if self.shared_bus is None else self.shared_bus.master
 
     @abstractmethod
     async def start(self) -> None:

@@ -32,7 +32,7 @@ from .devices import BusDevices
 from .discovery import async_set_up_now, async_wants_to_connect
 from .evse.bus import Bus
 from .evse.ews import EwsPort
-from .evse.listeners import tell
+from .evse.listeners import notify
 from .evse.model import ChargerConfig, Orders, Supply
 from .issues import BusIssues
 from .managed_charger import ManagedCharger, async_shut_down_chargers
@@ -102,13 +102,13 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         await self.connections.start()
 
     async def _async_start_supply(self) -> None:
-        if self.supply is None or self.connections.duty is None:
+        if self.supply is None or self.connections.master is None:
             return
         # The device registry outlives restarts: a known bus must have a stored order.
         is_new = not self.devices.has(self.config_entry.entry_id)
         if not await self.supply.async_start(is_new=is_new):
             self.issues.supply_lost(self.supply.limit)
-        self._unsubscribe.append(self.connections.duty.subscribe(self._on_duty))
+        self._unsubscribe.append(self.connections.master.subscribe(self._on_master))
 
     async def async_shutdown(self, _event: Event) -> None:
         """Send the shutdown commands and stop, when Home Assistant stops."""
@@ -147,13 +147,13 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
 
     async def _async_apply_supply(self, supply: Supply) -> None:
         self._notify(BUS)
-        if self.connections.duty is not None:
-            await self.connections.duty.change_supply(supply)
+        if self.connections.master is not None:
+            await self.connections.master.change_supply(supply)
 
     @callback
-    def _on_duty(self) -> None:
-        if self.connections.duty is not None:
-            self.issues.check_bus(self.connections.duty.noticed)
+    def _on_master(self) -> None:
+        if self.connections.master is not None:
+            self.issues.check_bus(self.connections.master.noticed)
         self._notify(BUS)
 
     # -- Add, change and remove chargers -----------------------------------------
@@ -218,7 +218,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         # Its new serial number may be that of a box that is being offered.
         async_set_up_now(self.hass, subentry)
         if changes_in_place(old.config, config):
-            old.set_up(config)
+            old.reconfigure(config)
         else:
             managed.unsubscribe()
             await managed.bus.remove(old)
@@ -389,4 +389,4 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
 
     @callback
     def _notify(self, context: Context) -> None:
-        tell(self._listeners.get(context, ()))
+        notify(self._listeners.get(context, ()))

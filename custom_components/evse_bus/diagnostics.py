@@ -116,7 +116,7 @@ def _bus(
 
 def _master(coordinator: BusCoordinator) -> dict[str, Any] | None:
     """Return the state of the bus master; ``None``: the protocol has none."""
-    duty = coordinator.connections.duty
+    duty = coordinator.connections.master
     if duty is None:
         return None
     data = {

@@ -122,4 +122,4 @@ async def async_shut_down_chargers(
 
 async def _async_shut_down(charger: Charger, removed: bool) -> None:  # noqa: FBT001
     async with asyncio.timeout(SHUTDOWN_TIMEOUT):
-        await charger.farewell(for_good=removed)
+        await charger.on_shutdown(removed=removed)

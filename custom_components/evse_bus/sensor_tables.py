@@ -166,8 +166,7 @@ def _fail_safe(charger: Charger) -> FailSafe | None:
     # A fail-safe current alone may be just for orders that nobody renews.
     if Capability.FAIL_SAFE_TIMEOUT in charger.capabilities:
         return FailSafe.FALLS_BACK
-    if charger.bus is not None and charger.bus.duty is not None:
-        # A slave without its master.
+    if charger.follows_master:
         return FailSafe.STOPS
     if Capability.SERVER in charger.capabilities:
         ends = charger.ends_in_silence

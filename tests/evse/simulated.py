@@ -12,15 +12,15 @@ from typing import Any, ClassVar, Self, override
 
 from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.charger import Charger
+from custom_components.evse_bus.evse.conversation import FollowUp
 from custom_components.evse_bus.evse.errors import LineLostError
-from custom_components.evse_bus.evse.exchange import Talk
+from custom_components.evse_bus.evse.exchange import Turn
 from custom_components.evse_bus.evse.framing import (
     Frame,
     Framer,
     LineSettings,
     Timing,
 )
-from custom_components.evse_bus.evse.jobs import Later
 from custom_components.evse_bus.evse.line import Line
 from custom_components.evse_bus.evse.model import (
     Capability,
@@ -215,11 +215,10 @@ class SimulatedConfig(ChargerConfig):
     minimum_interval: float = 0.0
 
 
-class SimulatedCharger(Charger):
+class SimulatedCharger(Charger[SimulatedConfig]):
     """Reads with ``R`` and writes amperes with ``W``; a pause is ``W 0``."""
 
     timing: ClassVar[Timing] = TIMING
-    config: SimulatedConfig
 
     def __init__(self, config: SimulatedConfig, orders: Orders) -> None:
         super().__init__(config, orders)
@@ -265,35 +264,35 @@ class SimulatedCharger(Charger):
 
         return accept
 
-    async def say(self, talk: Talk, command: str, value: int = 0) -> int:
-        self.spoken = talk.now
+    async def say(self, turn: Turn, command: str, value: int = 0) -> int:
+        self.spoken = turn.now
         request = bytes((ord("@"), self.config.address, ord(command), value))
-        return await talk.exchange(request, self._accept(command))
+        return await turn.exchange(request, self._accept(command))
 
     @override
-    async def poll(self, talk: Talk) -> Later[None] | None:
-        value = await self.say(talk, "R")
+    async def poll(self, turn: Turn) -> FollowUp | None:
+        value = await self.say(turn, "R")
         self.polls += 1
         self.reading = ChargerReading(offered_current=float(value))
         return None
 
     @override
-    async def impose(self, talk: Talk, orders: Orders, change: OrderChange) -> None:
-        await self.say(talk, "W", int(clamp(orders, self.limits).current))
+    async def apply(self, turn: Turn, orders: Orders, change: OrderChange) -> None:
+        await self.say(turn, "W", int(clamp(orders, self.limits).current))
 
     @override
-    def on_unsolicited(self, frame: Frame) -> Later[None] | None:
+    def on_unsolicited(self, frame: Frame) -> FollowUp | None:
         if (
             isinstance(frame, Telegram)
             and frame.address == self.config.address
             and chr(frame.command) == "?"
         ):
 
-            async def answer(talk: Talk) -> None:
+            async def answer(turn: Turn) -> None:
                 self.asked.append(frame.value)
-                await self.say(talk, "!", frame.value)
+                await self.say(turn, "!", frame.value)
 
-            return Later(0.0, answer)
+            return FollowUp(answer)
         return None
 
 

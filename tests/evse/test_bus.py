@@ -8,6 +8,7 @@ from math import isclose
 from hypothesis import given, settings, strategies as st
 import pytest
 
+from custom_components.evse_bus.evse.conversation import rest
 from custom_components.evse_bus.evse.errors import (
     GarbledReplyError,
     LineBusyError,
@@ -17,8 +18,7 @@ from custom_components.evse_bus.evse.errors import (
     ReplyTimeoutError,
     SupersededError,
 )
-from custom_components.evse_bus.evse.exchange import Talk
-from custom_components.evse_bus.evse.jobs import Later
+from custom_components.evse_bus.evse.exchange import Turn
 from custom_components.evse_bus.evse.model import OrderChange, Persistence
 
 from .simulated import TIMING, Device, Scene, SimulatedLine, now, simulate
@@ -227,8 +227,8 @@ def test_a_limit_is_repeated_and_a_once_command_is_not() -> None:
             await charger.change_orders(OrderChange(current=8.0))
             assert len(bus.line.times(1, "W")) == 3
 
-            async def once(talk: Talk) -> int:
-                return await charger.say(talk, "X")
+            async def once(turn: Turn) -> int:
+                return await charger.say(turn, "X")
 
             device.lose_next = 1
             with pytest.raises(ReplyTimeoutError):
@@ -286,7 +286,7 @@ def test_no_deadline_is_missed_whatever_else_the_bus_does(
     async def scene() -> None:
         bus = Scene(addresses=(1, 2, 3, 4, 5, 6), interval=interval)
         keeper = bus.make(7)
-        keeper.config = type(keeper.config)(
+        keeper._config = type(keeper.config)(
             key="7",
             name="keeper",
             address=7,
@@ -376,8 +376,8 @@ def test_noise_instead_of_an_answer_is_told_apart_from_silence() -> None:
             charger = bus.charger(1)
             bus.line.devices[1].answer = lambda _request: b"#$%&"
 
-            async def ask(talk: Talk) -> int:
-                return await charger.say(talk, "R")
+            async def ask(turn: Turn) -> int:
+                return await charger.say(turn, "R")
 
             with pytest.raises(GarbledReplyError):
                 await charger.run(ask)
@@ -398,17 +398,15 @@ def test_a_long_conversation_lets_others_speak_and_is_finished_at_a_stop() -> No
             await asyncio.sleep(1)
             charger = bus.charger(1)
 
-            async def second(talk: Talk) -> int:
-                return await charger.say(talk, "B")
-
-            async def first(talk: Talk) -> Later[int]:
-                await charger.say(talk, "A")
-                return Later(3.0, second)
+            async def in_two_turns(turn: Turn) -> int:
+                await charger.say(turn, "A")
+                await rest(3.0)
+                return await charger.say(turn, "B")
 
             before = len(bus.line.times(2))
-            await charger.run(first)
+            await charger.run(in_two_turns)
             assert len(bus.line.times(2)) - before >= 5
-            waiting = asyncio.create_task(charger.run(first))
+            waiting = asyncio.create_task(charger.run(in_two_turns))
             await asyncio.sleep(0.1)
             stopping = now()
         assert len(bus.line.times(1, "B")) == 2
@@ -481,8 +479,8 @@ def test_no_silence_no_speech() -> None:
             await asyncio.sleep(0.2)
             count = len(bus.line.sent)
 
-            async def ask(talk: Talk) -> int:
-                return await bus.charger(1).say(talk, "R")
+            async def ask(turn: Turn) -> int:
+                return await bus.charger(1).say(turn, "R")
 
             with pytest.raises(LineBusyError):
                 await bus.charger(1).run(ask)
@@ -535,14 +533,12 @@ def test_a_charger_that_leaves_ends_what_it_has_begun() -> None:
             await asyncio.sleep(1)
             charger = bus.charger(1)
 
-            async def second(talk: Talk) -> int:
-                return await charger.say(talk, "B")
+            async def in_two_turns(turn: Turn) -> int:
+                await charger.say(turn, "A")
+                await rest(3.0)
+                return await charger.say(turn, "B")
 
-            async def first(talk: Talk) -> Later[int]:
-                await charger.say(talk, "A")
-                return Later(3.0, second)
-
-            waiting = asyncio.create_task(charger.run(first))
+            waiting = asyncio.create_task(charger.run(in_two_turns))
             await asyncio.sleep(0.5)
             await bus.bus.remove(charger)
             assert await waiting == 0
@@ -557,7 +553,7 @@ def test_a_mistake_in_one_charger_does_not_end_the_bus() -> None:
         async with Scene(addresses=(1, 2), interval=1.0) as bus:
             await asyncio.sleep(5)
 
-            async def broken(_talk: Talk) -> None:
+            async def broken(_turn: Turn) -> None:
                 raise ZeroDivisionError
 
             bus.charger(1).poll = broken  # type: ignore[method-assign,assignment]

@@ -5,11 +5,11 @@ from typing import override
 
 import pytest
 
+from custom_components.evse_bus.evse.conversation import rest
 from custom_components.evse_bus.evse.errors import LineLostError, NotAvailableError
-from custom_components.evse_bus.evse.exchange import Talk
+from custom_components.evse_bus.evse.exchange import Turn
 from custom_components.evse_bus.evse.model import OrderChange, Orders
 from custom_components.evse_bus.evse.safety import clamp
-from custom_components.evse_bus.evse.turns import rest
 
 from .simulated import Scene, SimulatedCharger, SimulatedLine, simulate
 
@@ -18,11 +18,11 @@ class SlowCharger(SimulatedCharger):
     """Is sure of an order only in a second turn, as a box that takes its time."""
 
     @override
-    async def impose(self, talk: Talk, orders: Orders, change: OrderChange) -> None:
-        orders = self.target(change)
-        await self.say(talk, "W", int(clamp(orders, self.limits).current))
+    async def apply(self, turn: Turn, orders: Orders, change: OrderChange) -> None:
+        orders = self.confirmed_target(change)
+        await self.say(turn, "W", int(clamp(orders, self.limits).current))
         await rest(1.0)
-        await self.say(talk, "V")
+        await self.say(turn, "V")
 
 
 def slow(scene: Scene) -> SlowCharger:

@@ -1,7 +1,8 @@
 """One line's scheduler: one task owns the line, one exchange at a time.
 
-Who speaks next is `schedule.choose`'s to say, an exchange `exchange.Wire`'s;
-this module has the turns: retries, presence, reopening of a lost port.
+`schedule.choose` decides who speaks next, `exchange.Wire` has the exchange, and
+`jobs.JobQueue` the commands; this module has the turns: presence, deadlines,
+reopening of a lost port.
 """
 
 import asyncio
@@ -11,9 +12,8 @@ import logging
 from math import inf
 from typing import Final, Self
 
-from .alarm import Alarm
 from .charger import Charger
-from .duty import Duty
+from .conversation import Conversation, FollowUp, RunningConversation
 from .errors import (
     EvseError,
     ImplausibleReplyError,
@@ -22,15 +22,15 @@ from .errors import (
     NotAvailableError,
     PortMissingError,
 )
-from .exchange import Talk, Wire
+from .exchange import Turn, Wire
 from .framing import Frame, Framer, Timing
-from .jobs import Job, JobQueue, Later, Step
+from .jobs import Job, JobQueue
 from .line import Line
-from .listeners import Observed
-from .losses import Losses
+from .listeners import Observable
+from .master import BusMaster, ChargerGroup
 from .model import OrderChange, Persistence
 from .schedule import Kind, Slot, choose
-from .serving import serve
+from .throttle import LogThrottle
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -42,7 +42,34 @@ STOP_PATIENCE: Final = 6.0
 """Longest time a stop waits for a conversation begun (waking a car: 3 s), s."""
 
 
-class Bus(Observed):
+class WakeTimer:
+    """Sleeps until a time, or until something has changed."""
+
+    def __init__(self) -> None:
+        """Start without a sleeper."""
+        self._wake: asyncio.Future[None] | None = None
+
+    async def sleep_until(self, wake_at: float) -> None:
+        """Sleep until this loop time (inf: for ever), or until `wake`."""
+        loop = asyncio.get_running_loop()
+        self._wake = loop.create_future()
+        handle = None
+        if wake_at < inf:
+            handle = loop.call_at(wake_at, self.wake)
+        try:
+            await self._wake
+        finally:
+            self._wake = None
+            if handle is not None:
+                handle.cancel()
+
+    def wake(self) -> None:
+        """Wake the sleeper, if there is one."""
+        if self._wake is not None and not self._wake.done():
+            self._wake.set_result(None)
+
+
+class Bus(Observable):
     """All chargers of one line, and the line."""
 
     def __init__(
@@ -52,43 +79,43 @@ class Bus(Observed):
         timing: Timing,
         name: str = "",
         *,
-        duty: Duty | None = None,
+        group: ChargerGroup | None = None,
     ) -> None:
         """Put chargers on with `add`, then `start`.
 
-        Listeners are told when the port is lost or back.
+        ``group``: what all its chargers belong to, the master of the bus included.
+        Listeners are called when the port is lost or back.
         """
         super().__init__()
         self.line = line
         self.name = name or line.url
         self.wire = Wire(line, framer, timing)
-        self.wire.on_unasked = self._on_unasked
+        self.wire.on_unsolicited = self._on_unsolicited
         self.chargers: dict[str, Charger] = {}
         self.connected = False
         """The port is open."""
+        self.group = group
+        self.master = group if isinstance(group, BusMaster) else None
         self._was_open = False
-        self._losses = Losses(opened_by_peer=line.opened_by_peer)
-        self.shared: object | None = None
-        """What its chargers know together, where they are connectors of one box."""
+        self._log = LogThrottle(opened_by_peer=line.opened_by_peer)
         self._jobs = JobQueue()
         self._task: asyncio.Task[None] | None = None
         self._stopping = False
-        self._alarm = Alarm()
+        self._timer = WakeTimer()
         self._turn_of: Slot | None = None
         self._turn_over = asyncio.Event()
         self._last_probe = -inf
         line.on_lost = self._on_lost
-        self.duty = duty
-        if duty is not None:
-            duty.bus = self
+        if group is not None:
+            group.bus = self
 
     # -- Life --------------------------------------------------------------------
 
     async def start(self) -> None:
-        """Open the port and start; one that runs already goes on.
+        """Open the port and start; no effect on a bus that runs.
 
-        A line that the other end opens is waited for. Raises LineError when the port
-        cannot be opened, NotAvailableError when `stop` came first.
+        A line that the other end opens may be opened later. Raises LineError when the
+        port cannot be opened, NotAvailableError when `stop` came first.
         """
         if self._task is not None:
             return
@@ -107,12 +134,12 @@ class Bus(Observed):
         self._task = asyncio.create_task(self._run(), name=f"bus {self.name}")
 
     async def stop(self) -> None:
-        """Finish what is being said, close the port, leave nothing behind."""
+        """End conversations that have begun, close the port, leave nothing behind."""
         self._stopping = True
         stopped = NotAvailableError(f"{self.name} is stopped")
         self._jobs.fail_all(stopped, begun=False)
         if self._task is not None:
-            self.look_again()
+            self.reschedule()
             done, _ = await asyncio.wait({self._task}, timeout=STOP_PATIENCE)
             if not done:
                 self._task.cancel()
@@ -133,14 +160,16 @@ class Bus(Observed):
         await self.stop()
 
     def add(self, charger: Charger) -> None:
-        """Put a charger on the bus; the others do not notice."""
+        """Put a charger on the bus; the others are not disturbed."""
         charger.bus = self
         self.chargers[charger.config.key] = charger
+        if self.group is not None:
+            self.group.added(charger)
         charger.slot.worst_case = self.worst_case(charger)
-        self.look_again()
+        self.reschedule()
 
     async def remove(self, charger: Charger) -> None:
-        """Take a charger off; what it has begun (waking a car) is finished first."""
+        """Take a charger off; a conversation begun (waking a car) is ended first."""
         self._drop_jobs(charger, begun=False)
         with suppress(TimeoutError):
             async with asyncio.timeout(STOP_PATIENCE):
@@ -149,23 +178,21 @@ class Bus(Observed):
                     await self._turn_over.wait()
         self.chargers.pop(charger.config.key, None)
         self._drop_jobs(charger, begun=True)
+        if self.group is not None:
+            self.group.removed(charger)
         charger.bus = None
 
     def _is_busy_with(self, charger: Charger) -> bool:
         if self._turn_of is not None and _belongs(self._turn_of, charger):
             return True
         return self.connected and any(
-            job.begun for job in self._jobs if job.charger is charger
+            job.begun for job in self._jobs if job.owner is charger
         )
 
     def _drop_jobs(self, charger: Charger, *, begun: bool) -> None:
         gone = NotAvailableError(f"{charger.config.name} was removed")
         for job in self._jobs:
-            if (
-                job.charger is charger
-                and not job.under_way
-                and (begun or not job.begun)
-            ):
+            if job.owner is charger and not job.under_way and (begun or not job.begun):
                 self._jobs.fail(job, gone)
 
     # -- Commands ----------------------------------------------------------------
@@ -182,30 +209,32 @@ class Bus(Observed):
         if not self.connected:
             message = f"{self.name} is not connected"
             raise LineLostError(message)
-        if self.duty is not None and self.duty.refusal is not None:
-            raise NotAvailableError(self.duty.refusal)
+        if self.master is not None and self.master.refusal is not None:
+            raise NotAvailableError(self.master.refusal)
         if (waiting := self._jobs.merge(job)) is not None:
             self.wire.statistics.merged += 1
             job = waiting
         else:
             self._jobs.add(job)
-            self._respect_minimum(job.charger)
-        self.look_again()
-        # Whoever waits may give up; the command itself is still carried out. (A
-        # shield would report its failure, which then interests nobody.)
+            self._respect_minimum(self._charger_of(job))
+        self.reschedule()
+        # The caller may give up; the command itself is still carried out. (A shield
+        # would log a failure that no caller is left to handle.)
         await asyncio.wait({job.future})
         return job.future.result()
 
-    async def run[T](self, step: Step[T], *, kind: Kind = Kind.PROBE) -> T:
-        """Have a conversation that belongs to no charger (a scan)."""
+    async def run[T](
+        self, conversation: Conversation[T], *, kind: Kind = Kind.PROBE
+    ) -> T:
+        """Hold a conversation that belongs to no charger (a scan)."""
         job = Job(
-            charger=None,
+            owner=None,
             kind=kind,
             due=asyncio.get_running_loop().time(),
             worst_case=self.wire.exchange_time(),
-            step=step,
+            conversation=conversation,
         )
-        return await self.submit(job)  # type: ignore[return-value] # the step's own
+        return await self.submit(job)  # type: ignore[return-value] # the job's own
 
     def supersede(self, charger: Charger, which: Callable[[OrderChange], bool]) -> None:
         """Drop waiting order changes that a newer command makes wrong."""
@@ -216,9 +245,9 @@ class Bus(Observed):
         """Return the loop time, s."""
         return asyncio.get_running_loop().time()
 
-    def look_again(self) -> None:
+    def reschedule(self) -> None:
         """Choose anew who speaks next: something has changed."""
-        self._alarm.ring()
+        self._timer.wake()
 
     def worst_case(self, charger: Charger) -> float:
         """Return the longest time one turn of a charger can take, s."""
@@ -241,13 +270,13 @@ class Bus(Observed):
                 choice = choose(slots, loop.time(), self._last_probe)
                 slot = choice.slot
                 if slot is None:
-                    await self._alarm.sleep_until(choice.wake_at)
+                    await self._timer.sleep_until(choice.wake_at)
                     continue
                 self.wire.statistics.for_deadline += choice.for_deadline
                 await self._serve(slot)
             except Exception:
                 # Without this task all chargers of the bus would fall silent.
-                _LOGGER.exception("%s: a turn failed unforeseen", self.name)
+                _LOGGER.exception("%s: a turn failed unexpectedly", self.name)
                 if slot is not None:
                     slot.ready = loop.time() + self.wire.timing.backoff
 
@@ -264,77 +293,85 @@ class Bus(Observed):
     def _slots(self) -> list[Slot]:
         if self._stopping:
             return [job for job in self._jobs if job.begun]
-        if self.duty is not None and self.duty.silent:
-            return [self.duty.slot]
+        if self.master is not None and self.master.silent:
+            return [self.master.slot]
         slots: list[Slot] = [charger.slot for charger in self.chargers.values()]
         slots.extend(self._jobs.eligible())
-        if self.duty is not None:
-            slots.append(self.duty.slot)
+        if self.master is not None:
+            slots.append(self.master.slot)
         return slots
 
     async def _turn(self, slot: Slot, now: float) -> None:
-        if self.duty is not None and slot is self.duty.slot:
-            await self._duty_turn(self.duty, now)
+        if self.master is not None and slot is self.master.slot:
+            await self._master_turn(self.master, now)
             return
         if slot.kind is Kind.PROBE:
             self._last_probe = now
-        if isinstance(slot, Job):
-            charger = slot.charger
-        else:
-            charger = next(one for one in self.chargers.values() if one.slot is slot)
+        charger = self._charger_of(slot)
         if charger is not None and now > charger.slot.start_by:
             charger.statistics.missed_deadlines += 1
             self.wire.statistics.missed_deadlines += 1
         if isinstance(slot, Job):
-            await serve(slot, self.wire, self._jobs, connected=lambda: self.connected)
+            await self._jobs.serve(slot, self.wire, connected=lambda: self.connected)
         elif charger is not None:
             await self._poll_turn(charger)
         self._respect_minimum(charger)
 
-    async def _duty_turn(self, duty: Duty, now: float) -> None:
-        late = now > duty.slot.start_by
-        duty.statistics.missed_deadlines += late
+    def _charger_of(self, slot: Slot) -> Charger | None:
+        if isinstance(slot, Job):
+            return slot.owner if isinstance(slot.owner, Charger) else None
+        return next(one for one in self.chargers.values() if one.slot is slot)
+
+    async def _master_turn(self, master: BusMaster, now: float) -> None:
+        late = now > master.slot.start_by
+        master.statistics.missed_deadlines += late
         self.wire.statistics.missed_deadlines += late
-        duty.slot.served = now
+        master.slot.served = now
         try:
-            await duty.turn(Talk(self.wire, duty.statistics))
+            await master.turn(Turn(self.wire, master.statistics))
         except EvseError as error:
             _LOGGER.debug("%s: %s", self.name, error)
-            duty.failed(asyncio.get_running_loop().time())
+            master.failed(asyncio.get_running_loop().time())
         except Exception:
-            # A mistake of ours must not end the bus for everybody else.
-            _LOGGER.exception("%s: its own turn failed unforeseen", self.name)
-            duty.failed(asyncio.get_running_loop().time())
+            # A mistake of ours must not end the bus for all other chargers.
+            _LOGGER.exception("%s: the master's turn failed unexpectedly", self.name)
+            master.failed(asyncio.get_running_loop().time())
 
     async def _poll_turn(self, charger: Charger) -> None:
         loop = asyncio.get_running_loop()
         charger.expire_orders(loop.time())
+        poll = RunningConversation(
+            charger.poll(Turn(self.wire, charger.statistics)), bursts=charger.bursts
+        )
         try:
-            later = await charger.poll(Talk(self.wire, charger.statistics))
+            pause = await poll.go_on()
         except LineError as error:
             self._skip_poll(charger, error)
             return
         except ImplausibleReplyError as error:
-            # It did answer; what it said is held back and changes nothing.
+            # It did answer; an implausible reply changes nothing.
             _LOGGER.debug("%s: %s", charger.config.name, error)
             charger.statistics.implausible += 1
             charger.plan(loop.time())
             return
         except EvseError as error:
             _LOGGER.debug("%s: %s", charger.config.name, error)
-            charger.missed(loop.time())
+            charger.on_missed(loop.time())
             return
         except Exception:
-            # A mistake of ours must not end the bus for everybody else.
-            _LOGGER.exception("%s: a poll failed unforeseen", charger.config.name)
-            charger.missed(loop.time())
+            # A mistake of ours must not end the bus for all other chargers.
+            _LOGGER.exception("%s: a poll failed unexpectedly", charger.config.name)
+            charger.on_missed(loop.time())
             return
         now = loop.time()
-        charger.heard(now)
+        charger.on_reply(now)
         charger.plan(now)
-        if later is not None:
-            self._follow_up(charger, later, Persistence.STANDING)
-        if charger.told != charger.last_told:
+        if pause is not None:
+            rest_of_poll = FollowUp(charger.poll, pause.pause, pause.worst_case)
+            self._follow_up(charger, rest_of_poll, Persistence.STANDING, poll)
+        elif poll.result is not None:
+            self._follow_up(charger, poll.result, Persistence.STANDING)
+        if charger.fingerprint != charger.last_fingerprint:
             charger.updated()
 
     def _skip_poll(self, charger: Charger, error: LineError) -> None:
@@ -347,42 +384,47 @@ class Bus(Observed):
         charger.slot.ready = now + max(patience, charger.minimum_pause(now))
 
     def _follow_up(
-        self, charger: Charger, later: Later[None], persistence: Persistence
+        self,
+        charger: Charger,
+        follow_up: FollowUp,
+        persistence: Persistence,
+        running: RunningConversation[FollowUp | None] | None = None,
     ) -> None:
-        """Queue a turn that nobody waits for."""
+        """Queue a conversation without a caller; ``running``: it has begun."""
         now = asyncio.get_running_loop().time()
         self._jobs.add(
             Job(
-                charger=charger,
+                owner=charger,
                 kind=Kind.PAUSE,
-                ready=now + later.pause,
+                ready=now + follow_up.pause,
                 due=now,
-                worst_case=later.worst_case or self.worst_case(charger),
-                step=later.step,
+                worst_case=follow_up.worst_case or self.worst_case(charger),
+                conversation=follow_up.conversation,
+                running=running,
                 persistence=persistence,
             )
         )
-        self.look_again()
+        self.reschedule()
 
     def _respect_minimum(self, charger: Charger | None) -> None:
-        """Let nothing be said to a charger before its minimum interval is over."""
+        """Postpone all turns of a charger to the end of its minimum interval."""
         if charger is None:
             return
         now = asyncio.get_running_loop().time()
         earliest = now + charger.minimum_pause(now)
         charger.slot.ready = max(charger.slot.ready, earliest)
         for job in self._jobs:
-            if job.charger is charger and not (
+            if job.owner is charger and not (
                 charger.pauses_hurry and job.kind is Kind.PAUSE
             ):
                 job.ready = max(job.ready, earliest)
 
-    def _on_unasked(self, frame: Frame) -> bool:
-        if self.duty is not None and self.duty.heard(frame):
+    def _on_unsolicited(self, frame: Frame) -> bool:
+        if self.master is not None and self.master.on_unsolicited(frame):
             return True
         for charger in tuple(self.chargers.values()):
-            if (later := charger.on_unsolicited(frame)) is not None:
-                self._follow_up(charger, later, Persistence.ONCE)
+            if (follow_up := charger.on_unsolicited(frame)) is not None:
+                self._follow_up(charger, follow_up, Persistence.ONCE)
                 return True
         return False
 
@@ -396,26 +438,26 @@ class Bus(Observed):
             charger.on_line_open()
             # It may have heard us a moment ago, before the line was lost.
             charger.slot.ready = now + charger.minimum_pause(now)
-        if self.duty is not None:
-            self.duty.on_line_open(now)
+        if self.master is not None:
+            self.master.on_line_open(now)
         self.updated()
 
     def _on_lost(self, error: LineLostError) -> None:
-        self._losses.lost(self.name, error, self.now)
+        self._log.lost(self.name, error, self.now)
         self.connected = False
         self.wire.fail(error)
         self._jobs.fail_all(error)
-        if self.duty is not None:
-            self.duty.slot.start_by = inf
+        if self.master is not None:
+            self.master.slot.start_by = inf
         self._abandon_chargers()
         self.updated()
-        self.look_again()
+        self.reschedule()
 
-    def hush(self, why: str) -> None:
-        """Let nobody speak: what waits fails, and no reading is believed any more."""
+    def silence(self, why: str) -> None:
+        """Fail all waiting commands and drop all readings: the bus falls silent."""
         self._jobs.fail_all(NotAvailableError(why))
         self._abandon_chargers()
-        self.look_again()
+        self.reschedule()
 
     def _abandon_chargers(self) -> None:
         for charger in self.chargers.values():
@@ -427,7 +469,7 @@ class Bus(Observed):
         pause = REOPEN_FIRST
         while True:
             if not self._stopping:
-                await self._alarm.sleep_until(asyncio.get_running_loop().time() + pause)
+                await self._timer.sleep_until(asyncio.get_running_loop().time() + pause)
             if self._stopping:
                 return False
             try:
@@ -437,11 +479,11 @@ class Bus(Observed):
                 pause = min(pause * 2, REOPEN_LIMIT)
                 continue
             if self._was_open:
-                self._losses.back(self.name)
+                self._log.back(self.name)
                 self.wire.statistics.reopened += 1
             self._on_open()
             return True
 
 
 def _belongs(slot: Slot, charger: Charger) -> bool:
-    return slot is charger.slot or (isinstance(slot, Job) and slot.charger is charger)
+    return slot is charger.slot or (isinstance(slot, Job) and slot.owner is charger)

@@ -1,29 +1,34 @@
-"""What every charger shares, whatever it speaks: orders, presence, its turn.
+"""What all chargers share, in any protocol: orders, presence, turns on the bus.
 
-A protocol folder's charger derives from `Charger` and adds the conversation:
-what to ask, what to check, what to repeat. The rules for orders live here, so
-that they hold for every protocol alike:
+A protocol folder's charger derives from `Charger` and adds the conversations: what to
+ask, what to check, what to repeat. The rules for orders live here, so that they hold
+for every protocol alike:
 
 - a lowering counts (and is stored) before it is sent, a raise only after the
   charger has confirmed it;
 - permission and limit are independent of each other;
-- an order that nobody renewed for its lifetime becomes the fail-safe value.
+- an order that is not renewed within its lifetime becomes the fail-safe value.
+
+A charger knows its bus as a `Scheduler`.
 """
 
 from abc import ABC, abstractmethod
 import asyncio
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 import logging
 from math import inf
-from typing import TYPE_CHECKING, ClassVar, override
+from typing import ClassVar, Protocol, override
 
+from .conversation import Conversation, FollowUp, nothing
 from .errors import NotAvailableError
-from .exchange import Talk
+from .exchange import Turn, Wire
 from .framing import Frame, Timing
-from .jobs import Job, Later, Step, merge_key
-from .listeners import Observed
+from .jobs import Job, merge_key
+from .line import Line
+from .listeners import Observable
 from .model import (
     Capability,
     ChargerConfig,
@@ -40,61 +45,97 @@ from .readings import ChargerInfo, ChargerReading
 from .safety import Setpoint, cautious, check_change, clamp, expired
 from .schedule import Kind, Slot
 from .statistics import ChargerStatistics
-from .turns import Conversation, in_turns
-
-if TYPE_CHECKING:
-    from .bus import Bus
 
 _LOGGER = logging.getLogger(__name__)
 
 
-class Charger(Observed, ABC):
+class Scheduler(Protocol):
+    """A bus, as its chargers and its master know it."""
+
+    name: str
+    line: Line
+    wire: Wire
+
+    @property
+    def chargers(self) -> Mapping[str, Charger]:
+        """Return all chargers of the bus, by key."""
+
+    @property
+    def now(self) -> float:
+        """Return the loop time, s."""
+
+    async def submit(self, job: Job) -> object:
+        """Queue a command and return its result (see `Bus.submit`)."""
+
+    def supersede(self, charger: Charger, which: Callable[[OrderChange], bool]) -> None:
+        """Drop waiting order changes that a newer command makes wrong."""
+
+    def worst_case(self, charger: Charger) -> float:
+        """Return the longest time one turn of a charger can take, s."""
+
+    def reschedule(self) -> None:
+        """Choose anew who speaks next: something has changed."""
+
+    def silence(self, why: str) -> None:
+        """Fail all waiting commands; drop all readings."""
+
+
+class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
     """One charger on a bus."""
 
     timing: ClassVar[Timing]
     orders_keep_alive: ClassVar[bool] = False
-    """Imposing orders meets the deadline of the regular exchange as well."""
+    """Applying orders meets the deadline of the regular exchange as well."""
     pauses_hurry: ClassVar[bool] = False
     """A pause does not wait for the end of the minimum interval."""
+    follows_master: ClassVar[bool] = False
+    """It stops by itself when the master of its bus falls silent."""
+    bursts: ClassVar[bool] = False
+    """Its conversations rest only where they must wait: many exchanges in one turn."""
 
-    def __init__(self, config: ChargerConfig, orders: Orders) -> None:
-        """Take the orders that stand; nothing is sent before the bus starts."""
+    def __init__(self, config: C, orders: Orders) -> None:
+        """Begin with the orders that stand; nothing is sent before the bus starts."""
         super().__init__()
-        self.config = config
+        self._config = config
         self.orders = orders
-        self._wish = orders
+        self._requested = orders
         self.reading: ChargerReading | None = None
         self.info: ChargerInfo | None = None
         self.statistics = ChargerStatistics()
-        self.last_told: tuple[object, ...] = ()
-        """What `told` was when the listeners were told last."""
+        self.last_fingerprint: tuple[object, ...] = ()
+        """`fingerprint` at the last call of the listeners."""
         self.misses = 0
         """Requests left unanswered in a row."""
         self.available = False
-        """It answers, and what it said is what we know."""
+        """It answers, and its reading is up to date."""
         self.noticed: frozenset[Fault] = frozenset()
-        """Faults that we noticed, beside those it told."""
+        """Faults found by this library, beside those the charger reports."""
         self.orders_expired = False
-        """Nobody renewed the orders for their lifetime: the fail-safe counts."""
+        """The orders were not renewed within their lifetime: the fail-safe counts."""
         self.commit: Callable[[Orders], Awaitable[None]] = _no_commit
         """Stores orders; awaited before a lowering is sent, after a raise."""
         self.slot = Slot(kind=Kind.PROBE)
-        self._conversations: set[object] = set()
-        self.bus: Bus | None = None
+        self._conversations = 0
+        self.bus: Scheduler | None = None
         self._renewed: float | None = None
         self._clamped: tuple[tuple[Orders, Limits], Setpoint] | None = None
 
     # -- What it is and has ------------------------------------------------------
 
     @property
+    def config(self) -> C:
+        """Return how it is set up."""
+        return self._config
+
+    @property
     @abstractmethod
     def capabilities(self) -> frozenset[Capability]:
-        """Return what is known to be there; grows when more is learnt."""
+        """Return the known capabilities; more may become known later."""
 
     @property
     @abstractmethod
     def limits(self) -> Limits:
-        """Return what no order may exceed now."""
+        """Return the limits that no order may exceed now."""
 
     @property
     def effective_orders(self) -> Orders:
@@ -103,38 +144,37 @@ class Charger(Observed, ABC):
 
     @property
     def setpoint(self) -> Setpoint:
-        """Return what may be sent now."""
-        asked = (self.effective_orders, self.limits)
-        # Asked for with every poll, and hardly ever another one.
-        if self._clamped is None or self._clamped[0] != asked:
-            self._clamped = (asked, clamp(*asked))
+        """Return the set-point that the orders come to now."""
+        inputs = (self.effective_orders, self.limits)
+        # Computed for every poll, and rarely different.
+        if self._clamped is None or self._clamped[0] != inputs:
+            self._clamped = (inputs, clamp(*inputs))
         return self._clamped[1]
 
     @property
     def waits_for_current(self) -> bool:
-        """Return whether only a want of current has stopped it, by our own doing.
+        """Return whether it is paused by us for lack of current.
 
-        Its permission stands: the charger says that it may not charge, and gets that
-        taken back as soon as there is current.
+        Its permission stands: the pause is taken back as soon as there is current.
         """
         return False
 
     @property
     def ends_in_silence(self) -> bool | None:
-        """Return whether it ends a charge that nobody looks after, of its own accord.
+        """Return whether it ends a charge by itself when it loses its server.
 
-        ``None``: not known (yet); only where it has a server that it may miss.
+        ``None``: not known (yet), or it has no server.
         """
         return None
 
     @property
     def shares_address(self) -> bool:
-        """Return whether others on its bus hear what is said to it, by their nature."""
+        """Return whether other chargers on its bus obey requests to its address."""
         return False
 
     @property
-    def told(self) -> tuple[object, ...]:
-        """Return all that listeners may care about, to see whether it changed."""
+    def fingerprint(self) -> tuple[object, ...]:
+        """Return all state that listeners depend on; compared to find a change."""
         return (
             self.reading,
             self.available,
@@ -145,94 +185,103 @@ class Charger(Observed, ABC):
 
     @property
     def faults(self) -> frozenset[Fault]:
-        """Return the faults it told and those we noticed."""
-        told = self.reading.faults if self.reading else frozenset[Fault]()
-        return told | self.noticed
+        """Return the faults it reports and those found by this library."""
+        reported = self.reading.faults if self.reading else frozenset[Fault]()
+        return reported | self.noticed
 
-    # -- The conversation --------------------------------------------------------
-
-    @abstractmethod
-    async def poll(self, talk: Talk) -> Later[None] | None:
-        """Have the regular exchange; may ask for a further turn."""
+    # -- Conversations -----------------------------------------------------------
 
     @abstractmethod
-    async def impose(self, talk: Talk, orders: Orders, change: OrderChange) -> None:
-        """Make the charger follow these orders, through `clamp`; return when sure.
+    async def poll(self, turn: Turn) -> FollowUp | None:
+        """Have the regular exchange; return a conversation that it leads to.
 
-        They are what is `sought` by the change, which may be another one in a later turn.
-        ``change`` is what made these orders of those before: only where it says
-        ``allowed=True`` has the user switched charging on just now; a box that is
-        paused stays so after any other change. May take further turns.
-
-        Raises NotConfirmedError when the charger does not follow, and what
-        `Talk.exchange` raises.
+        May rest, as any conversation: with its first turn the charger has answered.
         """
 
-    def turns(self, conversation: Conversation) -> Step[None]:
-        """Return the first turn of a conversation with this charger."""
-        return in_turns(conversation)
+    @abstractmethod
+    async def apply(self, turn: Turn, orders: Orders, change: OrderChange) -> None:
+        """Make the charger follow these orders, through `clamp`; return when sure.
+
+        A conversation. The orders are `order_to_send` of the change, which may differ
+        in a later turn. ``change`` has led from the orders before to these: only where
+        it has ``allowed=True`` did the user switch charging on just now; a box that is
+        paused stays so after any other change.
+
+        Raises NotConfirmedError when the charger does not follow, and what
+        `Turn.exchange` raises.
+        """
 
     @property
     @abstractmethod
     def longest_request(self) -> int:
-        """Return the bytes of its longest request."""
+        """Return the length of its longest request, bytes."""
 
     @property
     def exchanges_per_turn(self) -> int:
-        """Return how many exchanges one turn may hold at most."""
+        """Return the number of exchanges that one turn may have at most."""
         return 1
 
-    def on_unsolicited(self, frame: Frame) -> Later[None] | None:  # noqa: ARG002
-        """Return an urgent turn for a frame nobody asked for; ``None``: not mine."""
+    def on_unsolicited(self, frame: Frame) -> FollowUp | None:  # noqa: ARG002
+        """Return an urgent conversation for an unsolicited frame.
+
+        ``None``: the frame is not from this charger.
+        """
         return None
 
-    async def farewell(self, *, for_good: bool = False) -> None:
-        """Say what is to be said when everything stops; orders stay as they are.
+    async def on_shutdown(self, *, removed: bool = False) -> None:
+        """Send the shutdown command, if there is one; orders stay as they are.
 
-        ``for_good``: only this charger is taken off, for ever; the bus goes on.
-
-        Raises what `run` raises.
+        ``removed``: only this charger is taken off for good; the bus goes on. Raises
+        what `run` raises.
         """
 
     @abstractmethod
     def on_line_open(self) -> None:
-        """Forget what must be checked anew after each (re)connect."""
+        """Drop all state that must be checked anew after each (re)connect."""
 
     def plan(self, now: float) -> None:
-        """Say in `slot` when the next regular exchange may and must be."""
+        """Set in `slot` when the next regular exchange may and must be."""
         self.slot.ready = self.slot.due = now + self.config.poll_interval
 
-    def set_up(self, config: ChargerConfig) -> None:
-        """Follow a changed set-up at once: a lower limit waits for no poll.
+    def reconfigure(self, config: ChargerConfig) -> None:
+        """Follow a changed configuration at once: a lower limit waits for no poll.
 
-        Who the charger is and how it is spoken to must be the same as before.
+        Identity and address must be the same as before. Raises TypeError for the
+        configuration of another protocol.
         """
-        self.config = config
+        own = type(self._config)
+        if not isinstance(config, own):
+            message = f"{self.config.name} needs a {own.__name__}"
+            raise TypeError(message)
+        self._config = config
         now = asyncio.get_running_loop().time()
         soon = now + self.minimum_pause(now)
         self.slot.ready = self.slot.due = min(self.slot.ready, soon)
         if self.bus is not None:
-            self.bus.look_again()
+            self.bus.reschedule()
+
+    def move(self, address: int) -> None:
+        """Follow a charger to another address on the bus."""
+        self._config = replace(self._config, address=address)
 
     @property
     def busy(self) -> bool:
         """Return whether a conversation is under way: then polls only read."""
-        return bool(self._conversations)
+        return self._conversations > 0
 
     @contextmanager
     def conversing(self) -> Iterator[None]:
-        """Note that a conversation is under way, until it ends or is cut short."""
-        token = object()
-        self._conversations.add(token)
+        """Count a conversation as under way until it ends or is closed."""
+        self._conversations += 1
         try:
             yield
         finally:
-            self._conversations.discard(token)
+            self._conversations -= 1
 
-    # -- What the bus tells ------------------------------------------------------
+    # -- Presence ----------------------------------------------------------------
 
-    def heard(self, now: float) -> None:
-        """Note a good answer."""
+    def on_reply(self, now: float) -> None:
+        """Take note of a good reply; the charger is available."""
         self.misses = 0
         self.slot.kind = Kind.POLL
         self.slot.served = now
@@ -240,8 +289,8 @@ class Charger(Observed, ABC):
             self.available = True
             _LOGGER.debug("%s answers", self.config.name)
 
-    def missed(self, now: float) -> None:
-        """Note an unanswered request; after some in a row the charger is gone."""
+    def on_missed(self, now: float) -> None:
+        """Take note of an unanswered request; after some in a row: unavailable."""
         self.misses += 1
         self.slot.kind = Kind.PROBE
         self.slot.start_by = inf
@@ -255,11 +304,11 @@ class Charger(Observed, ABC):
         self.slot.ready = self.slot.due = now + max(pause, self.minimum_pause(now))
 
     def minimum_pause(self, now: float) -> float:  # noqa: ARG002
-        """Return how long the charger must be left alone from now, s."""
+        """Return the time for which nothing may be sent to it from now on, s."""
         return 0.0
 
     def set_unavailable(self) -> None:
-        """Forget the reading: an old one is wrong, not a little out of date."""
+        """Drop the reading: a stale value would mislead."""
         was = self.available
         self.available = False
         self.reading = None
@@ -270,19 +319,19 @@ class Charger(Observed, ABC):
     # -- Orders ------------------------------------------------------------------
 
     async def change_orders(self, change: OrderChange) -> None:
-        """Change orders; return when the charger has confirmed what stands now.
+        """Change orders; return when the charger has confirmed the orders that stand.
 
-        Raises RefusedOrderError for an unusable wish, SupersededError when a
-        newer command came first, NotAvailableError, NotConfirmedError,
-        ExchangeError or LineError when the charger does not follow. A lowering
-        stands all the same, and is sent as soon as the charger can hear it.
+        Raises RefusedOrderError for an unusable value, SupersededError when a newer
+        command came first, NotAvailableError, NotConfirmedError, ExchangeError or
+        LineError when the charger does not follow. A lowering stands all the same,
+        and is sent as soon as the charger answers.
         """
         checked = check_change(change, self.limits)
         loop = asyncio.get_running_loop()
         if checked.is_about_now:
             self._renewed = loop.time()
             self.orders_expired = False
-        self._wish = checked.apply(self._wish)
+        self._requested = checked.apply(self._requested)
         lowered = cautious(self.orders, checked.apply(self.orders))
         if lowered != self.orders:
             self.orders = lowered
@@ -293,29 +342,30 @@ class Charger(Observed, ABC):
         if pause:
             bus.supersede(self, lambda waiting: waiting.allowed is True)
         job = Job(
-            charger=self,
+            owner=self,
             kind=Kind.PAUSE if pause else Kind.COMMAND,
             due=loop.time(),
             worst_case=bus.worst_case(self),
             meets=self.slot if self.orders_keep_alive else None,
-            step=_nothing,
+            conversation=nothing,
             persistence=Persistence.STANDING,
             merge_key=merge_key(checked),
             change=checked,
         )
-        job.step = self.turns(partial(self._impose_job, job))
+        # Its change may be another one by its turn: waiting changes are merged.
+        job.conversation = partial(self._apply_change, job)
         await bus.submit(job)
 
-    async def _impose_job(self, job: Job, talk: Talk) -> None:
-        """Impose an order change, and let it stand once it is confirmed."""
+    async def _apply_change(self, job: Job, turn: Turn) -> None:
+        """Apply the change of a job; let it stand once it is confirmed."""
         change = job.change or OrderChange()
-        await self.impose(talk, self.sought(change), change)
-        stands = self.target(change)
-        changed = stands != self.orders
-        self.orders = stands
+        await self.apply(turn, self.order_to_send(change), change)
+        confirmed = self.confirmed_target(change)
+        changed = confirmed != self.orders
+        self.orders = confirmed
         self.updated()
         if changed:
-            await self._store(stands)
+            await self._store(confirmed)
 
     async def _store(self, orders: Orders) -> None:
         try:
@@ -324,30 +374,29 @@ class Charger(Observed, ABC):
             # A full disk must not keep a pause from the wire.
             _LOGGER.exception("%s: orders were not stored", self.config.name)
 
-    def target(self, change: OrderChange) -> Orders:
-        """Return the orders that a change on its way leads to, as of now.
+    def confirmed_target(self, change: OrderChange) -> Orders:
+        """Return the orders that stand once a change under way is confirmed.
 
-        Others may have been confirmed since it set out. A newer lowering stands from
-        the moment it was said, whatever becomes of the commands before it and of its
-        own sending.
+        Other changes may have been confirmed meanwhile. A newer lowering stands from
+        the moment of its request, whether or not it has been sent.
         """
-        return cautious(change.apply(self.orders), self._wish)
+        return cautious(change.apply(self.orders), self._requested)
 
-    def sought(self, change: OrderChange) -> Orders:
-        """Return the orders to be imposed for a change: its target, unless expired.
+    def order_to_send(self, change: OrderChange) -> Orders:
+        """Return the orders to send for a change: its target, unless expired.
 
-        Who sets only the fail-safe renews nothing.
+        A change of the fail-safe alone renews nothing.
         """
-        target = self.target(change)
+        target = self.confirmed_target(change)
         return expired(target) if self.orders_expired else target
 
     def expire_orders(self, now: float) -> bool:
-        """Note that the orders' lifetime is over; return whether it just ended."""
+        """Expire orders whose lifetime is over; return whether they just expired."""
         lifetime = self.config.order_lifetime
         if lifetime is None or self.orders_expired:
             return False
         if self._renewed is None:
-            # Counted from the first turn: a restart gives automations their time.
+            # Counted from the first turn, so that automations can renew after a restart.
             self._renewed = now
         if now - self._renewed < lifetime:
             return False
@@ -368,7 +417,7 @@ class Charger(Observed, ABC):
         command: Command,
         value: bool | int | str | None = None,  # noqa: FBT001
     ) -> None:
-        """Carry out a command; return when it is known to have worked.
+        """Carry out a command; return when it is confirmed.
 
         Raises NotAvailableError where the charger has no such command, and what
         `change_orders` raises.
@@ -378,11 +427,11 @@ class Charger(Observed, ABC):
 
     @property
     def settings(self) -> Mapping[Setting, Range]:
-        """Return what can be set in the charger's own memory, and how far."""
+        """Return the settings in the charger's own memory, and their ranges."""
         return {}
 
     async def configure(self, setting: Setting, value: int) -> None:
-        """Set something in the charger's own memory; return when it is read back.
+        """Write to the charger's own memory; return when it is read back.
 
         Such a memory wears out: this is for people, not for automations. Raises
         NotAvailableError where the charger has no such setting, RefusedOrderError
@@ -393,24 +442,28 @@ class Charger(Observed, ABC):
 
     async def run[T](
         self,
-        step: Step[T],
+        conversation: Conversation[T],
         *,
         persistence: Persistence = Persistence.ONCE,
         kind: Kind = Kind.COMMAND,
     ) -> T:
-        """Have a conversation of one's own with this charger; return its result."""
+        """Hold a conversation with this charger; return its result.
+
+        Raises what the conversation raises, NotConfirmedError (see `rest`),
+        NotAvailableError and LineLostError.
+        """
         bus = self._bus()
         job = Job(
-            charger=self,
+            owner=self,
             kind=kind,
             due=asyncio.get_running_loop().time(),
             worst_case=bus.worst_case(self),
-            step=step,
+            conversation=conversation,
             persistence=persistence,
         )
-        return await bus.submit(job)  # type: ignore[return-value]
+        return await bus.submit(job)  # type: ignore[return-value] # the job's own
 
-    def _bus(self) -> Bus:
+    def _bus(self) -> Scheduler:
         if self.bus is None:
             message = f"{self.config.name} is on no bus"
             raise NotAvailableError(message)
@@ -420,8 +473,8 @@ class Charger(Observed, ABC):
 
     @override
     def updated(self) -> None:
-        """Tell the listeners."""
-        self.last_told = self.told
+        """Call the listeners."""
+        self.last_fingerprint = self.fingerprint
         super().updated()
 
     async def wait_available(self, patience: float = 60.0) -> ChargerReading:
@@ -430,13 +483,13 @@ class Charger(Observed, ABC):
         Raises NotAvailableError when the charger has not answered within
         ``patience`` seconds.
         """
-        heard = asyncio.Event()
-        stop = self.subscribe(heard.set)
+        changed = asyncio.Event()
+        stop = self.subscribe(changed.set)
         try:
             async with asyncio.timeout(patience):
                 while self.reading is None or not self.available:
-                    heard.clear()
-                    await heard.wait()
+                    changed.clear()
+                    await changed.wait()
                 return self.reading
         except TimeoutError as error:
             message = f"{self.config.name} does not answer"
@@ -445,7 +498,7 @@ class Charger(Observed, ABC):
             stop()
 
     def notice(self, fault: Fault, *, present: bool) -> None:
-        """Set or clear a fault that we noticed ourselves, and tell of a change."""
+        """Set or clear a fault found by this library; listeners hear of a change."""
         if present != (fault in self.noticed):
             self.noticed = self.noticed ^ {fault}
             self.updated()
@@ -453,7 +506,3 @@ class Charger(Observed, ABC):
 
 async def _no_commit(_orders: Orders) -> None:
     """Store nothing: the default for a script without a store."""
-
-
-async def _nothing(_talk: Talk) -> None:
-    """Do nothing: the place of a step that is set right after."""

@@ -36,7 +36,7 @@ class Wire:
         self.timing = timing
         self.statistics = BusStatistics()
         self.frames = FrameLog()
-        self.on_unasked: Callable[[Frame], bool] = lambda _frame: False
+        self.on_unsolicited: Callable[[Frame], bool] = lambda _frame: False
         """Called with a good frame that is no answer; returns whether it was ours."""
         self.sent_at: float | None = None
         """Loop time at which the last request had left; ``None``: it did not."""
@@ -76,7 +76,7 @@ class Wire:
         reply_may_equal: bool = False,
         patience: float = 0.0,
     ) -> T:
-        """Send a request and wait for its answer (see `Talk.exchange`)."""
+        """Send a request and wait for its answer (see `Turn.exchange`)."""
         self.sent_at = None
         await self._silence()
         data = request() if callable(request) else request
@@ -122,7 +122,7 @@ class Wire:
         return result  # type: ignore[return-value] # accept's own type
 
     async def send(self, request: Request) -> float:
-        """Send what nobody answers (see `Talk.send`)."""
+        """Send what nobody answers (see `Turn.send`)."""
         self.sent_at = None
         await self._silence()
         data = request() if callable(request) else request
@@ -177,13 +177,13 @@ class Wire:
     def _on_frame(self, frame: Frame) -> None:
         if self._pending is not None and self._pending.offer(frame):
             return
-        if self.on_unasked(frame):
+        if self.on_unsolicited(frame):
             self.statistics.unsolicited += 1
         else:
             self.statistics.foreign_frames += 1
 
 
-class Talk:
+class Turn:
     """What a conversation may do in its turn: exchanges, one after the other."""
 
     def __init__(self, wire: Wire, counted: ChargerStatistics) -> None:
@@ -221,7 +221,7 @@ class Talk:
         that is not the answer, and raises for an answer that says no.
 
         ``patience`` is added to the reply time-out, s: the turn must have been given
-        the time for it (`Later.worst_case`).
+        the time for it (`FollowUp.worst_case`).
 
         Raises ReplyTimeoutError, GarbledReplyError, LineBusyError, LineLostError
         and what ``accept`` raises.

@@ -1,52 +1,56 @@
-"""Conversations that wait for the bus, and the queue they wait in."""
+"""Conversations that wait for the bus: their queue, and one turn of each."""
 
 import asyncio
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 import logging
-from typing import TYPE_CHECKING
+from typing import Protocol
 
-from .errors import EvseError, SupersededError
-from .exchange import Talk
-from .model import OrderChange, Persistence
+from .conversation import Conversation, RunningConversation
+from .errors import (
+    EvseError,
+    ExchangeRefusedError,
+    LineBusyError,
+    NotAvailableError,
+    ReplyTimeoutError,
+    SupersededError,
+)
+from .exchange import Turn, Wire
+from .model import OrderChange, Orders, Persistence
 from .schedule import Slot
-
-if TYPE_CHECKING:
-    from .charger import Charger
+from .statistics import ChargerStatistics
 
 _LOGGER = logging.getLogger(__name__)
 
-type Step[T] = Callable[[Talk], Awaitable[T | Later[T]]]
-"""One turn of a conversation: returns its result, or what is to come later."""
 
+class JobOwner(Protocol):
+    """The charger of a job."""
 
-@dataclass(frozen=True, slots=True)
-class Later[T]:
-    """The rest of a conversation, after a pause in which others may speak."""
+    orders: Orders
+    statistics: ChargerStatistics
 
-    pause: float
-    """s"""
-    step: Step[T]
-    worst_case: float | None = None
-    """Longest time its next turn can take, s; ``None``: as the turn before it, or as any
-    turn of its charger."""
+    @property
+    def bursts(self) -> bool:
+        """Return whether its conversations rest only where they must wait."""
 
 
 @dataclass(slots=True, eq=False, kw_only=True)
 class Job(Slot):
-    """A command waiting for the bus."""
+    """A conversation waiting for the bus."""
 
-    charger: Charger | None
-    step: Step[object]
+    owner: JobOwner | None
+    conversation: Conversation[object]
+    running: RunningConversation[object] | None = None
+    """The conversation, once it has begun."""
     persistence: Persistence = Persistence.ONCE
     merge_key: str | None = None
-    """A newer waiting job of this charger with the same key is merged into it."""
+    """A newer waiting job of this owner with the same key is merged into it."""
     change: OrderChange | None = None
     """The order change it carries; merged jobs carry both."""
     raises: bool = False
-    """It asks for more than stood when it was said."""
+    """It asked for more than stood at the time."""
     begun: bool = False
-    """Its first turn is over; the rest must be finished even when we stop."""
+    """Its first turn is over; the rest must be finished even when the bus stops."""
     under_way: bool = False
     """It has the bus right now."""
     tries: int = 0
@@ -56,14 +60,14 @@ class Job(Slot):
 
 
 class JobQueue:
-    """What waits for the bus besides the regular polls."""
+    """All that waits for the bus besides the regular polls."""
 
     def __init__(self) -> None:
         """Start empty."""
         self._jobs: list[Job] = []
 
     def __iter__(self) -> Iterator[Job]:
-        """Return what waits now; the queue may change meanwhile."""
+        """Return the waiting jobs; the queue may change meanwhile."""
         return iter(tuple(self._jobs))
 
     def __contains__(self, job: object) -> bool:
@@ -71,33 +75,33 @@ class JobQueue:
         return job in self._jobs
 
     def eligible(self) -> Iterator[Job]:
-        """Return what may have a turn now, as far as the queue is concerned.
+        """Return the jobs that may have a turn now, as far as the queue is concerned.
 
         A lowering or a pause goes at any time. A raise or a start waits for the
         changes before it: half done or to be repeated, their end would undo it.
         """
-        changing: set[Charger | None] = set()
+        changing: set[JobOwner | None] = set()
         for job in self._jobs:
-            if job.charger not in changing or not job.raises:
+            if job.owner not in changing or not job.raises:
                 yield job
             if job.change is not None:
-                changing.add(job.charger)
+                changing.add(job.owner)
 
     def add(self, job: Job) -> None:
-        """Let a job wait."""
+        """Add a job."""
         job.raises = _raises(job)
         self._jobs.append(job)
 
     def merge(self, job: Job) -> Job | None:
         """Merge a job into a waiting one of its kind, and return that, if any.
 
-        Only order changes merge, and only before they are under way: the newer
-        wish wins where both speak. A pause merges with nothing but a pause.
+        Only order changes merge, and only before they are under way: where both set a
+        value the newer one counts. A pause merges with nothing but a pause.
         """
         if job.merge_key is None or job.change is None:
             return None
         for waiting in reversed(self._jobs):
-            if (waiting.charger, waiting.merge_key) != (job.charger, job.merge_key):
+            if (waiting.owner, waiting.merge_key) != (job.owner, job.merge_key):
                 continue
             if waiting.change is None or waiting.begun or waiting.under_way:
                 # Nor into an older one: this one's end would undo it.
@@ -107,11 +111,11 @@ class JobQueue:
             return waiting
         return None
 
-    def supersede(self, charger: Charger, which: Callable[[OrderChange], bool]) -> None:
+    def supersede(self, owner: JobOwner, which: Callable[[OrderChange], bool]) -> None:
         """Drop waiting order changes that a newer command makes wrong."""
         for job in self:
             if (
-                job.charger is charger
+                job.owner is owner
                 and job.change is not None
                 and not (job.begun or job.under_way)
                 and which(job.change)
@@ -119,17 +123,19 @@ class JobQueue:
                 self.fail(job, SupersededError("a newer command came first"))
 
     def done(self, job: Job, result: object) -> None:
-        """End a job well."""
+        """End a job with a result."""
         self._remove(job)
         if not job.future.done():
             job.future.set_result(result)
 
     def fail(self, job: Job, error: Exception) -> None:
-        """End a job badly; whoever waits for it is told."""
+        """End a job with an error, which its caller gets."""
         self._remove(job)
+        if job.running is not None and not job.under_way:
+            job.running.close()
         if not job.future.done():
             job.future.set_exception(error)
-            # Nobody may be waiting any more (a follow-up of a poll): no warning.
+            # A follow-up has no caller that would retrieve it: no warning.
             job.future.exception()
         _LOGGER.debug("A command failed: %s", error)
 
@@ -143,16 +149,64 @@ class JobQueue:
         if job in self._jobs:
             self._jobs.remove(job)
 
+    async def serve(
+        self, job: Job, wire: Wire, *, connected: Callable[[], bool]
+    ) -> None:
+        """Give a job a turn; then it is done, waits for its next turn, or fails."""
+        if job.future.cancelled():
+            self.fail(job, NotAvailableError("its caller has given up"))
+            return
+        job.tries += 1
+        job.under_way = True
+        statistics = job.owner.statistics if job.owner else ChargerStatistics()
+        if job.running is None:
+            job.running = RunningConversation(
+                job.conversation(Turn(wire, statistics)),
+                bursts=job.owner is not None and job.owner.bursts,
+            )
+        try:
+            pause = await job.running.go_on()
+        except (ReplyTimeoutError, LineBusyError) as error:
+            if _may_repeat(job, wire) and connected():
+                job.running = None
+                wire.statistics.retries += 1
+                now = asyncio.get_running_loop().time()
+                job.ready = now + wire.timing.retry_pauses[0]
+            else:
+                self.fail(job, error)
+        except EvseError as error:
+            statistics.refused += isinstance(error, ExchangeRefusedError)
+            self.fail(job, error)
+        except Exception as error:
+            # A mistake of ours must not end the bus for all other chargers.
+            _LOGGER.exception("%s: a command failed unexpectedly", wire.line.url)
+            self.fail(job, EvseError(f"{type(error).__name__}: {error}"))
+        else:
+            if pause is None:
+                self.done(job, job.running.result)
+            else:
+                job.ready = asyncio.get_running_loop().time() + pause.pause
+                if pause.worst_case is not None:
+                    job.worst_case = pause.worst_case
+                job.begun = True
+                job.tries = 0
+        finally:
+            job.under_way = False
+
 
 def merge_key(change: OrderChange) -> str | None:
     """Merge limits with limits and pauses with pauses, and nothing with a start."""
     return {None: "limits", False: "pause", True: None}[change.allowed]
 
 
+def _may_repeat(job: Job, wire: Wire) -> bool:
+    return job.persistence is not Persistence.ONCE and job.tries < wire.timing.attempts
+
+
 def _raises(job: Job) -> bool:
     """Return whether a change asks for more than stands; a pause never does."""
-    if job.charger is None or job.change is None or job.change.allowed is False:
+    if job.owner is None or job.change is None or job.change.allowed is False:
         return False
-    # What it lowers has been lowered in the orders already.
-    orders = job.charger.orders
+    # A lowering is in the orders already.
+    orders = job.owner.orders
     return job.change.allowed is True or job.change.apply(orders) != orders

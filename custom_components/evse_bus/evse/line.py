@@ -6,13 +6,20 @@ the adapter hears itself (common on two-wire RS-485).
 """
 
 import asyncio
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 import errno
 import socket
-from typing import TYPE_CHECKING, ClassVar, override
+from typing import ClassVar, override
 
-from serialx import Parity, SerialException, StopBits, create_serial_connection
+from serialx import (
+    BaseSerialTransport,
+    Parity,
+    SerialException,
+    StopBits,
+    create_serial_connection,
+)
 
 from .errors import (
     LineError,
@@ -22,13 +29,7 @@ from .errors import (
     PortPermissionError,
     PortSettingsError,
 )
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from serialx import BaseSerialTransport
-
-    from .framing import LineSettings
+from .framing import LineSettings
 
 OPEN_TIMEOUT = 10.0
 """Longest wait for a port to open (a network port may not answer), s."""

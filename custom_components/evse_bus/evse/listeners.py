@@ -1,4 +1,4 @@
-"""Telling whoever wants to know, whatever they make of it."""
+"""Calling listeners after a change."""
 
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -7,11 +7,11 @@ import logging
 _LOGGER = logging.getLogger(__name__)
 
 
-def tell(listeners: Iterable[Callable[[], None]]) -> None:
-    """Call each listener; one that fails is logged and keeps nobody else waiting.
+def notify(listeners: Iterable[Callable[[], None]]) -> None:
+    """Call each listener; one that fails is logged, and the others are still called.
 
-    The bus tells from the one task that speaks with all chargers: somebody else's
-    mistake must not end it.
+    The bus notifies from the one task that serves all chargers: an error in a listener
+    must not end it.
     """
     for listener in tuple(listeners):
         try:
@@ -20,18 +20,18 @@ def tell(listeners: Iterable[Callable[[], None]]) -> None:
             _LOGGER.exception("A listener failed")
 
 
-class Observed:
-    """Somebody of whom others want to know when something has changed."""
+class Observable:
+    """An object with listeners that are called after each change."""
 
     def __init__(self) -> None:
-        """Nobody wants to know yet."""
+        """Start without listeners."""
         self._listeners: list[Callable[[], None]] = []
 
     def subscribe(self, listener: Callable[[], None]) -> Callable[[], None]:
-        """Call back after each change of what is known; return how to stop."""
+        """Add a listener; return a function that removes it."""
         self._listeners.append(listener)
         return partial(self._listeners.remove, listener)
 
     def updated(self) -> None:
-        """Tell the listeners."""
-        tell(self._listeners)
+        """Call the listeners."""
+        notify(self._listeners)

@@ -8,13 +8,9 @@ from dataclasses import dataclass
 from decimal import ROUND_FLOOR, Decimal
 from math import isfinite
 from numbers import Real
-from typing import TYPE_CHECKING
 
 from .errors import RefusedOrderError
-from .model import CurrentLimit, OrderChange, Orders
-
-if TYPE_CHECKING:
-    from .model import Limits, Phases
+from .model import CurrentLimit, Limits, OrderChange, Orders, Phases
 
 MAXIMUM_TIMEOUT = 0xFFFF
 """Longest fail-safe time-out a protocol can say, s (EVBox: one word)."""

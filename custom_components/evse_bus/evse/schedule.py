@@ -10,13 +10,10 @@ The rules (they are the bus's promises, each with a test):
   a dead charger costs a living one at most one reply time-out a round.
 """
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from math import inf
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
 
 
 class Kind(IntEnum):

@@ -1,14 +1,12 @@
 """What a bus counts, and the last frames that passed on it."""
 
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import StrEnum
 from math import inf
 from time import time
-from typing import TYPE_CHECKING, Final
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
+from typing import Final
 
 WINDOW: Final = 60.0
 """Time over which utilisation is told, s."""

@@ -14,7 +14,7 @@ from homeassistant.helpers.selector import (
 )
 import probatio as vol
 
-from ..evse.found import Address
+from ..evse.scan import Address
 
 if TYPE_CHECKING:
     from ..evse.protocol import Protocol

@@ -25,9 +25,9 @@ from ..const import (
     CONF_STOP_ON_SHUTDOWN,
     CONF_VOLTAGE,
 )
-from ..evse.found import Address
 from ..evse.model import MINIMUM_CURRENT
 from ..evse.safety import MAXIMUM_TIMEOUT
+from ..evse.scan import Address
 from .address import ADDRESSES, Errors
 from .schema import (
     COMMANDS,
@@ -45,8 +45,8 @@ from .schema import (
 if TYPE_CHECKING:
     from homeassistant.config_entries import ConfigSubentry, ConfigSubentryData
 
-    from ..evse.found import FoundCharger
     from ..evse.protocol import Protocol
+    from ..evse.scan import FoundCharger
 
 CONF_EXPERT: Final = "expert"
 
@@ -151,7 +151,7 @@ def charger_form(
         form[vol.Optional(CONF_INSTALLATION_LIMIT_2)] = amperes(MINIMUM_CURRENT)
     if new:
         form[vol.Required(CONF_FAIL_SAFE_CURRENT, default=MINIMUM_CURRENT)] = amperes()
-        if protocol.probe_imposes:
+        if protocol.probe_sets_limits:
             form[
                 vol.Required(CONF_FAIL_SAFE_TIMEOUT, default=DEFAULT_FAIL_SAFE_TIMEOUT)
             ] = quantity(1, MAXIMUM_TIMEOUT, 1, "s")

@@ -52,9 +52,9 @@ from ..evse.errors import (
     PortPermissionError,
 )
 from ..evse.ews import Listener
-from ..evse.found import FoundCharger
 from ..evse.protocols import PROTOCOLS
 from ..evse.readings import ChargerInfo
+from ..evse.scan import FoundCharger
 from .address import Errors
 from .charger import Candidate, short_name
 from .steps import ChargerSteps

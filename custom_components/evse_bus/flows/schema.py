@@ -40,9 +40,9 @@ from ..evse.safety import INTERVALS_PER_TIMEOUT, MAXIMUM_TIMEOUT, number
 from .address import ADDRESSES, Errors
 
 if TYPE_CHECKING:
-    from ..evse.found import FoundCharger
     from ..evse.framing import LineSettings
     from ..evse.protocol import Protocol
+    from ..evse.scan import FoundCharger
 
 # Keys of the forms that are stored under another name, or not at all.
 CONF_LINE: Final = "line"

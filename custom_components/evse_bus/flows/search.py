@@ -23,9 +23,9 @@ from ..evse.errors import (
     PortPermissionError,
     PortSettingsError,
 )
-from ..evse.found import Address, ScanReport
 from ..evse.line import Line
 from ..evse.model import ChargerConfig, CurrentLimit, Orders
+from ..evse.scan import Address, ScanResult
 from .address import ADDRESSES
 from .schema import CONF_SEARCH_CURRENT
 
@@ -109,21 +109,24 @@ def nothing_imposed(protocol: Protocol) -> list[Imposed]:
 
 
 def _config(protocol: Protocol, address: int, more: Mapping[str, Any]) -> ChargerConfig:
-    return protocol.config(key="search", name="search", address=address, **more)
+    config: ChargerConfig = protocol.config(
+        key="search", name="search", address=address, **more
+    )
+    return config
 
 
 async def async_search(
     protocol: Protocol, bus: Bus, searches: Sequence[Imposed], progress: Progress
-) -> ScanReport:
+) -> ScanResult:
     """Search a started bus, once for each set of values; return all that was found.
 
     Raises LineError and what else the bus raises.
     """
-    reports: list[ScanReport] = []
+    reports: list[ScanResult] = []
     for config, orders in searches:
         share = partial(_share, progress, len(reports), len(searches))
         reports.append(await protocol.scan(bus, config, orders, share))
-    return ScanReport(
+    return ScanResult(
         found=tuple(one for report in reports for one in report.found),
         duplicates=tuple(one for report in reports for one in report.duplicates),
         unreadable=any(report.unreadable for report in reports),

@@ -16,7 +16,7 @@ from ..const import (
     SUBENTRY_CHARGER,
 )
 from ..discovery import box_unique_id, is_set_up
-from ..evse.found import Address, ScanReport
+from ..evse.scan import Address, ScanResult
 from .address import ADDRESSES, Errors, manual_form, typed_addresses
 from .charger import (
     Candidate,
@@ -38,8 +38,8 @@ from .search import error_key
 from .supply import supply_texts
 
 if TYPE_CHECKING:
-    from ..evse.found import FoundCharger
     from ..evse.protocol import Progress, Protocol
+    from ..evse.scan import FoundCharger
 
 
 class ChargerSteps[
@@ -63,15 +63,15 @@ class ChargerSteps[
         self.ready: list[ConfigSubentryData] = []
         self.suggestions: dict[str, Any] = {}
         """Values typed so far that the next forms offer again."""
-        self._scan_task: asyncio.Task[ScanReport] | None = None
-        self._report = ScanReport()
+        self._scan_task: asyncio.Task[ScanResult] | None = None
+        self._report = ScanResult()
         self._error: str | None = None
         self._pending: list[Candidate] = []
 
     # -- What the two flows do differently ---------------------------------------
 
     @abstractmethod
-    async def async_scan(self, progress: Progress) -> ScanReport:
+    async def async_scan(self, progress: Progress) -> ScanResult:
         """Search the bus; leave no port open that was not open before."""
 
     @abstractmethod

@@ -23,7 +23,7 @@ from ..const import (
     SUBENTRY_CHARGER,
 )
 from ..evse.errors import NotAvailableError
-from ..evse.found import Address, ScanReport
+from ..evse.scan import Address, ScanResult
 from .address import ADDRESSES, Errors, typed_addresses
 from .charger import (
     charger_data,
@@ -71,7 +71,7 @@ class ChargerSubentryFlow(
             return self.async_abort(reason=self._full_reason)
         # A search that sets limits is left to the charger's own first turn; and
         # the address that every box answers to is not for a bus with others on it.
-        searchable = not (self.protocol.probe_imposes or self.protocol.dials_in)
+        searchable = not (self.protocol.probe_sets_limits or self.protocol.dials_in)
         if not searchable or entry.state is not ConfigEntryState.LOADED:
             return await self.async_step_manual()
         return self.async_show_menu(
@@ -102,13 +102,13 @@ class ChargerSubentryFlow(
         if not isinstance(lines, ListenerConnections):
             return []
         strangers = lines.listener.strangers
-        self._report = ScanReport(
+        self._report = ScanResult(
             found=tuple(found_box(one.serial, one.firmware) for one in strangers)
         )
         return [one.serial for one in strangers]
 
     @override
-    async def async_scan(self, progress: Progress) -> ScanReport:
+    async def async_scan(self, progress: Progress) -> ScanResult:
         """Search between the turns of the chargers that are running."""
         lines = self._lines()
         if lines is None or lines.shared_bus is None:
@@ -131,7 +131,7 @@ class ChargerSubentryFlow(
             unique_id=charger["unique_id"],
         )
 
-    # -- Later -------------------------------------------------------------------
+    # -- FollowUp -------------------------------------------------------------------
 
     async def async_step_reconfigure(
         self, user_input: dict[str, Any] | None = None

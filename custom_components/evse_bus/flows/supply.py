@@ -23,7 +23,7 @@ HIGHEST_MINIMUM: Final = 16.0
 
 def supply_form(protocol: Protocol) -> vol.Schema:
     """Ask what all chargers share; nothing, where each is on its own."""
-    if protocol.duty is None:
+    if protocol.master is None:
         return vol.Schema({})
     return vol.Schema(
         {

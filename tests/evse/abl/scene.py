@@ -116,13 +116,13 @@ class Scene:
 
     def lively(self, charger: AblCharger) -> None:
         """End what `quiet` began."""
-        charger.config = replace(charger.config, poll_interval=0.01)
+        charger._config = replace(charger.config, poll_interval=0.01)
         charger.slot.ready = 0
         self.bus.add(charger)
 
     async def quiet(self, charger: AblCharger) -> None:
         """Let only commands speak from now on, so that it is known who says what."""
-        charger.config = replace(charger.config, poll_interval=FOREVER)
+        charger._config = replace(charger.config, poll_interval=FOREVER)
         await until(lambda: charger.slot.ready > FOREVER)
 
     async def polled(self, charger: AblCharger, times: int = 2) -> None:

@@ -7,7 +7,7 @@ from time import monotonic
 import pytest
 
 from custom_components.evse_bus.evse.errors import LineLostError
-from custom_components.evse_bus.evse.found import ScanReport
+from custom_components.evse_bus.evse.scan import ScanResult
 from tests.virtual import AblBox
 
 from .scene import READING, Scene, config, orders, until
@@ -22,7 +22,7 @@ def few_ids(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scanning, "ADDRESSES", range(1, 6))
 
 
-async def scan(scene: Scene, progress: list[float] | None = None) -> ScanReport:
+async def scan(scene: Scene, progress: list[float] | None = None) -> ScanResult:
     told = [] if progress is None else progress
     return await scene.protocol.scan(scene.bus, config(), orders(), told.append)
 
@@ -65,7 +65,7 @@ async def test_boxes_awake_asleep_and_dead() -> None:
 async def test_an_empty_bus_takes_twice_the_silence_of_each() -> None:
     async with Scene() as scene:
         start = monotonic()
-        assert await scan(scene) == ScanReport()
+        assert await scan(scene) == ScanResult()
         silence = scene.protocol.timing.reply_timeout
         assert monotonic() - start < 12 * (silence + 0.05) + 1.0
 
@@ -93,7 +93,7 @@ async def test_two_new_boxes_alone() -> None:
         AblBox(1, serial="2W22xy00000002", jitter=0.0, turn_round=0.0023),
     )
     async with Scene(*boxes) as scene:
-        assert await scan(scene) == ScanReport(duplicates=(1,))
+        assert await scan(scene) == ScanResult(duplicates=(1,))
 
 
 @pytest.mark.usefixtures("few_ids")
@@ -113,7 +113,7 @@ async def test_garbage_everywhere_is_an_unfit_line() -> None:
         for _ in range(10):
             one.faults.once("replace", b"\x3e\xb0\xb1\xff\x00\x8d")
     async with Scene(*boxes) as scene:
-        assert await scan(scene) == ScanReport(unreadable=True)
+        assert await scan(scene) == ScanResult(unreadable=True)
 
 
 @pytest.mark.usefixtures("few_ids")

@@ -13,7 +13,7 @@ from custom_components.evse_bus.evse.errors import (
     ReplyTimeoutError,
     WrongChargerError,
 )
-from custom_components.evse_bus.evse.evbox import PROTOCOL, EvboxCharger, EvboxConfig
+from custom_components.evse_bus.evse.evbox import EvboxCharger, EvboxConfig
 from custom_components.evse_bus.evse.model import (
     Capability,
     ChargerConfig,
@@ -61,9 +61,9 @@ def test_a_set_up_that_cannot_be_sent_is_refused(values: dict[str, Any]) -> None
 
 
 def test_another_protocols_set_up_is_refused() -> None:
-    config = ChargerConfig(key="a", name="A", address=1)
-    with pytest.raises(TypeError, match="EVBox"):
-        PROTOCOL.charger(config, ORDERS)
+    charger = EvboxCharger(EvboxConfig(key="a", name="A", address=1), ORDERS)
+    with pytest.raises(TypeError, match="EvboxConfig"):
+        charger.reconfigure(ChargerConfig(key="a", name="A", address=1))
 
 
 def test_what_each_command_has() -> None:

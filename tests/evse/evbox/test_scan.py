@@ -8,8 +8,8 @@ import pytest
 
 from custom_components.evse_bus.evse.errors import LineBusyError, RefusedOrderError
 from custom_components.evse_bus.evse.evbox import PROTOCOL, EvboxConfig
-from custom_components.evse_bus.evse.found import ScanReport
 from custom_components.evse_bus.evse.model import CurrentLimit, Orders
+from custom_components.evse_bus.evse.scan import ScanResult
 from tests.evse.simulated import now, simulate
 from tests.virtual import EvboxChargePoint, Module
 from tests.virtual.evbox_frames import frame
@@ -26,7 +26,7 @@ CONFIRMED = Orders(
 
 async def find(
     stage: Scene, config: EvboxConfig = ANYBODY, orders: Orders = CONFIRMED
-) -> tuple[ScanReport, list[float]]:
+) -> tuple[ScanResult, list[float]]:
     progress: list[float] = []
     report = await PROTOCOL.scan(stage.bus, config, orders, progress.append)
     assert progress == sorted(progress)
@@ -107,7 +107,7 @@ def test_one_box_that_knows_69_only() -> None:
     async def scene() -> None:
         async with Scene.of(EvboxChargePoint(7, commands={69})) as stage:
             report, _ = await find(stage)
-            assert report == ScanReport()
+            assert report == ScanResult()
             report, _ = await find(stage, replace(ANYBODY, command=69))
             (one,) = report.found
             assert (one.address, one.serial) == (0, None)
@@ -156,7 +156,7 @@ def test_nobody_there() -> None:
         async with Scene.of() as stage:
             started = now()
             report, _ = await find(stage)
-            assert report == ScanReport()
+            assert report == ScanResult()
             assert now() - started < 24.0
 
     simulate(scene())

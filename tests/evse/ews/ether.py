@@ -13,6 +13,7 @@ from custom_components.evse_bus.evse.ews import PROTOCOL
 from custom_components.evse_bus.evse.ews.charger import EwsPort
 from custom_components.evse_bus.evse.ews.config import EwsPortConfig
 from custom_components.evse_bus.evse.ews.events import Event
+from custom_components.evse_bus.evse.ews.session import Ports
 from custom_components.evse_bus.evse.ews.timing import SETTINGS
 from custom_components.evse_bus.evse.framing import Timing
 from custom_components.evse_bus.evse.line import Line
@@ -186,7 +187,9 @@ class EwsScene:
     def __post_init__(self) -> None:
         self.line = Ether()
         self.cars = (Car(max_current=32.0), Car(max_current=32.0))
-        self.bus = Bus(self.line, PROTOCOL.framer(), self.timing, "simulated")
+        self.bus = Bus(
+            self.line, PROTOCOL.framer(), self.timing, "simulated", group=Ports()
+        )
         for port in self.ports:
             self.bus.add(self.make_charger(port))
         self._life: asyncio.Task[None] | None = None
@@ -260,7 +263,7 @@ class EwsScene:
             lambda: all(
                 one.reading is not None
                 and not one._conversations
-                and not one.limiter.must_assert()
+                and not one.limiter.must_reassert()
                 for one in map(self.charger, self.ports)
             )
         )

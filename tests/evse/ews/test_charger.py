@@ -9,11 +9,10 @@ from custom_components.evse_bus.evse.errors import (
     RefusedOrderError,
 )
 from custom_components.evse_bus.evse.ews import PROTOCOL
-from custom_components.evse_bus.evse.ews.config import EwsPortConfig, ews_config
+from custom_components.evse_bus.evse.ews.config import EwsPortConfig
 from custom_components.evse_bus.evse.ews.frames import Bcc
 from custom_components.evse_bus.evse.model import (
     Capability,
-    ChargerConfig,
     Fault,
     OrderChange,
     Status,
@@ -169,8 +168,6 @@ def test_a_box_in_the_place_of_another_is_noticed_before_a_word() -> None:
 def test_the_set_up() -> None:
     with pytest.raises(ValueError, match="no port"):
         EwsPortConfig(key="a", name="a", address=3)
-    with pytest.raises(TypeError):
-        ews_config(ChargerConfig(key="a", name="a", address=1))
     assert EwsPortConfig(key="a", name="a", address=2).port == 2
 
 

@@ -14,7 +14,7 @@ from custom_components.evse_bus.evse.errors import (
     RefusedOrderError,
 )
 from custom_components.evse_bus.evse.ews import session
-from custom_components.evse_bus.evse.ews.config import EwsPortConfig, ews_config
+from custom_components.evse_bus.evse.ews.config import EwsPortConfig
 from custom_components.evse_bus.evse.model import (
     ChargerConfig,
     Command,
@@ -81,13 +81,13 @@ def test_the_zone_may_change_while_it_runs() -> None:
             ("Asia/Tokyo", 19, 3),
         ):
             known = None if zone is None else ZoneInfo(zone)
-            config = ews_config(port.config)
-            port.set_up(replace(config, time_zone=known))
+            config = port.config
+            port.reconfigure(replace(config, time_zone=known))
             await asyncio.sleep(30)
             assert scene.box.clock().hour == hour, zone
             assert len(scene.line.named("sc")) == sets, zone
         with pytest.raises(TypeError):
-            port.set_up(ChargerConfig(key="a", name="a", address=1))
+            port.reconfigure(ChargerConfig(key="a", name="a", address=1))
         assert isinstance(port.config, EwsPortConfig)
 
     play(EwsScene(), acts)

@@ -11,7 +11,6 @@ from custom_components.evse_bus.evse.errors import (
     RefusedOrderError,
 )
 from custom_components.evse_bus.evse.ews.answers import EwsRefusedError
-from custom_components.evse_bus.evse.ews.config import ews_config
 from custom_components.evse_bus.evse.model import (
     Command,
     Fault,
@@ -248,12 +247,12 @@ def test_a_lower_installation_limit_does_not_wait_for_what_has_failed(
     async def acts(scene: EwsScene) -> None:
         await scene.charge()
         port = scene.charger()
-        config = ews_config(port.config)
-        port.set_up(replace(config, time_zone=ZoneInfo("Asia/Tokyo")))
+        config = port.config
+        port.reconfigure(replace(config, time_zone=ZoneInfo("Asia/Tokyo")))
         await scene.until(lambda: "sc" in [one.name for one in scene.line.sent])
         await asyncio.sleep(2)
         said_at = now()
-        port.set_up(replace(port.config, installation_limit=8.0))
+        port.reconfigure(replace(port.config, installation_limit=8.0))
         await scene.until(lambda: scene.box.ports[0].limit == 8)
         assert now() - said_at < 4
 

@@ -279,7 +279,7 @@ def test_a_bus_that_is_stopped_leaves_nothing() -> None:
                 await bus.stop()
                 await until(lambda: dialler.opened >= 2 or not dialler.connected)
                 with pytest.raises(NotAvailableError):
-                    await bus.run(lambda _talk: asyncio.sleep(0))  # type: ignore[arg-type, return-value]
+                    await bus.run(lambda _turn: asyncio.sleep(0))  # type: ignore[arg-type, return-value]
                 await bus.start()
                 await until(lambda: bus.connected)
             await made.forget(SERIAL)

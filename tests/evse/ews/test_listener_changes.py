@@ -143,7 +143,7 @@ def test_a_box_that_gives_another_number_later_keeps_nobody_out() -> None:
                 await until(lambda: false.ports[1].limit == 16)
                 writes = len(false.writes)
                 false.serial = OTHER
-                bus.shared.status_due = float("-inf")  # type: ignore[attr-defined, union-attr]
+                bus.group.box.status_due = float("-inf")  # type: ignore[union-attr]
                 await until(lambda: dialler.dropped)
                 assert Fault.WRONG_CHARGER in first(bus).noticed
                 assert not first(bus).available

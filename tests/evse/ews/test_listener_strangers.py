@@ -12,7 +12,7 @@ from custom_components.evse_bus.evse.ews import listener as listening
 from custom_components.evse_bus.evse.ews.accepted import AcceptedLine
 from custom_components.evse_bus.evse.ews.info import KEYS
 from custom_components.evse_bus.evse.ews.session import MOST_KEYS
-from custom_components.evse_bus.evse.losses import MOST_LOST
+from custom_components.evse_bus.evse.throttle import LOSSES
 from tests.virtual.ews_box import EwsBox as VirtualBox
 
 from .dialling import (
@@ -157,7 +157,7 @@ def test_who_comes_and_goes_does_not_fill_the_log(
     """With the number of a box that is away anybody is taken for it."""
     monkeypatch.setattr(bus_module, "REOPEN_FIRST", 0.01)
     monkeypatch.setattr(listening, "PROOF_PAUSE", 0.0)
-    cycles = MOST_LOST + 10
+    cycles = LOSSES + 10
 
     async def scene() -> None:
         async with server() as made, expected(made) as bus:
@@ -175,7 +175,7 @@ def test_who_comes_and_goes_does_not_fill_the_log(
     run(scene)
     told = [one.getMessage() for one in caplog.records if one.levelname == "WARNING"]
     for words in ("was lost", "connected again", "connected and answers"):
-        assert 0 < sum(words in one for one in told) <= MOST_LOST
+        assert 0 < sum(words in one for one in told) <= LOSSES
 
 
 def test_keys_that_nobody_can_press_are_not_told() -> None:

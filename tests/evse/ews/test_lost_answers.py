@@ -14,6 +14,7 @@ from custom_components.evse_bus.evse.ews.answers import EwsRefusedError, Refusal
 from custom_components.evse_bus.evse.ews.events import (
     ChargeEnded,
 )
+from custom_components.evse_bus.evse.ews.session import Ports
 from custom_components.evse_bus.evse.model import Fault, OrderChange, Status
 
 from .ether import EwsScene, now, play
@@ -210,7 +211,7 @@ def test_a_restart_of_ours_does_not_unlock_what_we_have_paused(
         old = scene.charger()
         await scene.bus.remove(old)
         scene.allowed = False
-        scene.bus.shared = None
+        scene.bus.group = Ports()
         scene.bus.add(scene.make_charger(1))
         await scene.until(lambda: scene.charger().reading is not None)
         await scene.charger().change_orders(OFF)

@@ -45,7 +45,7 @@ def test_a_slow_first_port_holds_up_nobody() -> None:
 
     async def acts(scene: EwsScene) -> None:
         port = scene.charger()
-        port.set_up(replace(port.config, poll_interval=300.0))
+        port.reconfigure(replace(port.config, poll_interval=300.0))
         await asyncio.sleep(3)
         begin = now()
         await asyncio.sleep(120)

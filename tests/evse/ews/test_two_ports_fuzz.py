@@ -122,9 +122,9 @@ class Run:
                 self.go(port, OrderChange(fail_safe_current=value))
             case "installation", float():
                 self._watch()
-                charger.set_up(replace(charger.config, installation_limit=value))
+                charger.reconfigure(replace(charger.config, installation_limit=value))
             case "lifetime", (None | float()) as lifetime:
-                charger.set_up(replace(charger.config, order_lifetime=lifetime))
+                charger.reconfigure(replace(charger.config, order_lifetime=lifetime))
             case "car", str():
                 names = {"come": car.plug_in, "leave": car.leave}
                 names |= {"ask": car.request, "finish": car.finish}

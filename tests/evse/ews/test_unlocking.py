@@ -263,14 +263,14 @@ def test_a_charge_that_begins_between_look_and_order_is_not_paused() -> None:
         box = scene.charger().box
         original, told = box.tell, []
 
-        async def tell(talk: Any, command: Any, make: Any) -> None:  # noqa: ANN401
+        async def tell(turn: Any, command: Any, make: Any) -> None:  # noqa: ANN401
             if not told:
                 told.append(command)
                 scene.box.ports[0].release_start("somebody")
                 scene.box.step()
                 assert scene.status() == 0x40
                 box.hear(Info(changes=Change.PORT_1, keys=(0,) * 8))
-            await original(talk, command, make)
+            await original(turn, command, make)
 
         box.tell = tell  # type: ignore[method-assign]
         since = now()
@@ -287,9 +287,9 @@ def test_records_without_end_are_not_waited_for() -> None:
         box = scene.charger().box
         original = box.tell
 
-        async def tell(talk: Any, command: Any, make: Any) -> None:  # noqa: ANN401
+        async def tell(turn: Any, command: Any, make: Any) -> None:  # noqa: ANN401
             box.hear(Info(changes=Change.PORT_1, keys=(0,) * 8))
-            await original(talk, command, make)
+            await original(turn, command, make)
 
         box.tell = tell  # type: ignore[method-assign]
         since = now()

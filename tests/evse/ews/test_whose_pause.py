@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 
 from custom_components.evse_bus.evse.errors import EvseError
+from custom_components.evse_bus.evse.ews.session import Ports
 from custom_components.evse_bus.evse.model import CurrentLimit, OrderChange, Orders
 
 from .ether import EwsScene, now, play
@@ -23,9 +24,9 @@ def amperes(current: float) -> OrderChange:
 async def begin_anew(scene: EwsScene, orders: Orders, **config: float | None) -> None:
     """Let Home Assistant restart: it knows the orders and nothing else."""
     await scene.bus.remove(scene.charger())
-    scene.bus.shared = None
+    scene.bus.group = Ports()
     charger = scene.make_charger(1)
-    charger.config = replace(charger.config, **config)  # type: ignore[arg-type]
+    charger._config = replace(charger.config, **config)  # type: ignore[arg-type]
     scene.bus.add(type(charger)(charger.config, orders))
     await scene.until(lambda: scene.charger().reading is not None)
 

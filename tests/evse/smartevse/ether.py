@@ -205,7 +205,7 @@ class MasterScene:
     def new_bus(self) -> None:
         """Home Assistant starts anew; the boxes have lived on."""
         self.master = Master(Supply(limit=self.limit, minimum=self.minimum))
-        self.bus = Bus(self.line, RtuFramer(), TIMING, "simulated", duty=self.master)
+        self.bus = Bus(self.line, RtuFramer(), TIMING, "simulated", group=self.master)
 
     def plug_box(self, unit: int, dialect: str = "2.17") -> Box:
         car = Car(max_current=32.0)

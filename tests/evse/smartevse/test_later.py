@@ -1,9 +1,9 @@
-"""Later dialects need quiet: their own cycle stands still while others ask."""
+"""FollowUp dialects need quiet: their own cycle stands still while others ask."""
 
 import asyncio
 from itertools import pairwise
 
-from custom_components.evse_bus.evse.exchange import Talk
+from custom_components.evse_bus.evse.exchange import Turn
 from custom_components.evse_bus.evse.model import Fault, OrderChange
 from custom_components.evse_bus.evse.smartevse.dialects import MAPS
 from custom_components.evse_bus.evse.smartevse.registers import read_request
@@ -94,8 +94,8 @@ def test_other_requests_on_the_line_count_as_well() -> None:
         scene.seen.append(lambda: errors.append(scene.outlet.error))
         await scene.charge()
 
-        async def ask(talk: Talk) -> None:
-            await talk.send(read_request(5, MAPS[LATER].status))
+        async def ask(turn: Turn) -> None:
+            await turn.send(read_request(5, MAPS[LATER].status))
 
         for _ in range(20):
             await asyncio.sleep(9.1)

@@ -2,14 +2,13 @@
 
 import asyncio
 from contextlib import suppress
-from functools import partial
 from random import Random
 
 import pytest
 
+from custom_components.evse_bus.evse.conversation import FollowUp, rest
 from custom_components.evse_bus.evse.errors import EvseError
-from custom_components.evse_bus.evse.exchange import Talk
-from custom_components.evse_bus.evse.jobs import Later
+from custom_components.evse_bus.evse.exchange import Turn
 from custom_components.evse_bus.evse.model import (
     OrderChange,
     Persistence,
@@ -48,9 +47,11 @@ def test_late_echoes_of_several_broadcasts_are_no_other_master() -> None:
     simulate(scene())
 
 
-async def endless(left: int, _talk: Talk) -> Later[None] | None:
+async def endless(_turn: Turn) -> None:
+    for _ in range(10):
+        await asyncio.sleep(0.45)
+        await rest()
     await asyncio.sleep(0.45)
-    return Later(0.0, partial(endless, left - 1)) if left else None
 
 
 def test_a_broadcast_that_is_late_goes_before_what_waited_longer() -> None:
@@ -60,8 +61,8 @@ def test_a_broadcast_that_is_late_goes_before_what_waited_longer() -> None:
         async with MasterScene(units=(2, 3)) as scene:
             await asyncio.sleep(6)
             for unit in (2, 3):
-                later = Later[None](0.0, partial(endless, 10), 0.45)
-                scene.bus._follow_up(scene.slave(unit), later, Persistence.ONCE)
+                follow_up = FollowUp(endless, worst_case=0.45)
+                scene.bus._follow_up(scene.slave(unit), follow_up, Persistence.ONCE)
             loop = asyncio.get_running_loop()
             assert isinstance(loop, SimulatedLoop)
             planned = scene.master.slot.ready

@@ -6,8 +6,8 @@ import pytest
 
 from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.errors import NotAvailableError, RefusedOrderError
-from custom_components.evse_bus.evse.found import ScanReport
 from custom_components.evse_bus.evse.model import Fault, OrderChange, Supply
+from custom_components.evse_bus.evse.scan import ScanResult
 from custom_components.evse_bus.evse.smartevse import MASTER
 from custom_components.evse_bus.evse.smartevse.master import OTHERS, Master
 from tests.evse.simulated import now, simulate
@@ -17,7 +17,7 @@ FOREIGN = bytes.fromhex("001000010004080064003c00000000ff7a")
 READ = bytes.fromhex("040400a00009307b")
 
 
-async def scan(bus: Bus, scene: MasterScene) -> ScanReport:
+async def scan(bus: Bus, scene: MasterScene) -> ScanResult:
     config, orders = scene.make(2).config, scene.make(2).orders
     return await MASTER.scan(bus, config, orders, lambda _share: None)
 
@@ -179,9 +179,9 @@ def test_the_scan_beside_another_master_says_so_and_nothing_else() -> None:
             looking = asyncio.create_task(scan(scene.bus, scene))
             await asyncio.sleep(1)
             scene.line.say(FOREIGN)
-            assert await looking == ScanReport(other_master=True)
+            assert await looking == ScanResult(other_master=True)
             assert scene.line.sent == []
-            assert await scan(scene.bus, scene) == ScanReport(other_master=True)
+            assert await scan(scene.bus, scene) == ScanResult(other_master=True)
 
     simulate(scene())
 

@@ -7,13 +7,13 @@ from typing import ClassVar, Literal, override
 import pytest
 
 from custom_components.evse_bus.evse.bus import Bus
-from custom_components.evse_bus.evse.found import ScanReport
 from custom_components.evse_bus.evse.model import (
     CurrentLimit,
     OrderChange,
     Orders,
     Supply,
 )
+from custom_components.evse_bus.evse.scan import ScanResult
 from custom_components.evse_bus.evse.smartevse import MASTER, SlaveConfig, master
 from tests.virtual import Car, SmartEvse, VirtualBus, smartevse_requests_in
 from tests.virtual.device import Device
@@ -175,7 +175,7 @@ async def test_the_scan_finds_slaves_and_says_nothing_else() -> None:
         VirtualBus.pty(*boxes) as virtual,
         MASTER.bus(virtual.url, supply=Supply()) as bus,
     ):
-        report: ScanReport = await MASTER.scan(
+        report: ScanResult = await MASTER.scan(
             bus, config(2), Orders(limit=CurrentLimit(current=6.0)), lambda _share: None
         )
         assert [found.address for found in report.found] == [2, 4]
@@ -189,8 +189,8 @@ async def test_a_box_that_is_master_itself_silences_us() -> None:
         bus = MASTER.bus(virtual.url, supply=Supply(limit=16.0))
         put_on(bus, 2)
         async with bus:
-            assert bus.duty is not None
-            duty = bus.duty
+            assert bus.master is not None
+            duty = bus.master
             await virtual.wait_for_async(lambda: duty.noticed, timeout=PATIENCE)
             await asyncio.sleep(1.5)
             assert smartevse_requests_in(virtual) == []

@@ -385,7 +385,7 @@ def test_farewell(dialect: Dialect, *, stop: bool) -> None:
     async def acts(scene: PolledScene) -> None:
         await scene.charge()
         before = scene.charger.orders
-        await scene.charger.farewell()
+        await scene.charger.on_shutdown()
         assert scene.outlet.access is not stop
         assert scene.charger.orders == before
 

@@ -275,7 +275,7 @@ def test_a_start_half_done_does_not_outlive_the_farewell(dialect: Dialect) -> No
         since = now()
         await scene.until(lambda: scene.currents(since))
         await asyncio.sleep(0.2)
-        await scene.charger.farewell()
+        await scene.charger.on_shutdown()
         await scene.bus.stop()
         with suppress(EvseError):
             await start
@@ -291,10 +291,10 @@ def test_a_limit_that_no_order_took_away_comes_back(dialect: Dialect) -> None:
         await scene.charge()
         await scene.polled(3)
         config = scene.charger.config
-        scene.charger.set_up(replace(config, installation_limit=5.0))
+        scene.charger.reconfigure(replace(config, installation_limit=5.0))
         await scene.until(lambda: scene.box.offers == 0, 20)
         await scene.polled(2)
-        scene.charger.set_up(config)
+        scene.charger.reconfigure(config)
         await scene.until(lambda: scene.box.offers == 10, 40)
         # A no at the box is another matter.
         scene.box.controller.outlet.set_access(False)

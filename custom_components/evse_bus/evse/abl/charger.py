@@ -7,18 +7,17 @@ given by ourselves. PROTOCOLS.md, 2.
 
 from typing import Final, override
 
+from ..conversation import FollowUp
 from ..errors import (
     GarbledReplyError,
     NotAvailableError,
 )
-from ..exchange import Talk
-from ..jobs import Later
-from ..model import ChargerConfig, Command, Fault, OrderChange, Orders
+from ..exchange import Turn
+from ..model import Command, Fault, OrderChange, Orders
 from ..safety import Setpoint, clamp
-from ..turns import in_turns
 from .commands import CommandSet
 from .duty import PAUSE, is_within
-from .reader import AblReader
+from .reader import AblConfig, AblReader
 from .registers import (
     Reading,
     limit_duty,
@@ -32,7 +31,7 @@ GARBLED: Final = 3
 class AblCharger(AblReader):
     """One ABL wallbox."""
 
-    def __init__(self, config: ChargerConfig, orders: Orders) -> None:
+    def __init__(self, config: AblConfig, orders: Orders) -> None:
         """Take the set-up; the box is not known before it answers."""
         super().__init__(config, orders)
         self._commands = CommandSet(self)
@@ -43,8 +42,6 @@ class AblCharger(AblReader):
     @override
     def on_line_open(self) -> None:
         super().on_line_open()
-        # A conversation that was cut short with the line does not come to its end.
-        self._conversations.clear()
         self._commands.release()
 
     @override
@@ -56,10 +53,10 @@ class AblCharger(AblReader):
     # -- The regular exchange ----------------------------------------------------
 
     @override
-    async def poll(self, talk: Talk) -> Later[None] | None:
+    async def poll(self, turn: Turn) -> FollowUp | None:
         try:
-            await self.identify(talk)
-            raw = await self.read_once(talk)
+            await self.identify(turn)
+            raw = await self.read_once(turn)
         except GarbledReplyError:
             self._garbled += 1
             if self._garbled >= GARBLED:
@@ -67,25 +64,25 @@ class AblCharger(AblReader):
             raise
         self._garbled = 0
         self.notice(Fault.DUPLICATE_ADDRESS, present=False)
-        await self.read_flags_if_due(talk, raw)
-        self.take(raw, talk.now)
-        return self._what_now(raw)
+        await self.read_flags_if_due(turn, raw)
+        self.take(raw, turn.now)
+        return self._next_action(raw)
 
-    def _what_now(self, raw: Reading) -> Later[None] | None:
+    def _next_action(self, raw: Reading) -> FollowUp | None:
         """Return what must be said because of a reading."""
         if self.busy:
             return None
         if self.owes is not None:
             if self.owes.is_open(raw.state):
-                return Later(0.0, in_turns(self._commands.give_back))
+                return FollowUp(self._commands.give_back)
             self.owes = None
-        if self._must_assert(raw):
-            return Later(0.0, in_turns(self._assert))
+        if self._must_reassert(raw):
+            return FollowUp(self._reassert)
         if self.tells_icmax is None:
-            return Later(0.0, self.look_for_icmax)
+            return FollowUp(self.look_for_icmax)
         return None
 
-    def _must_assert(self, raw: Reading) -> bool:
+    def _must_reassert(self, raw: Reading) -> bool:
         if raw.state in SETUP:
             return False
         duty = limit_duty(self.setpoint)
@@ -104,18 +101,18 @@ class AblCharger(AblReader):
     # -- Orders ------------------------------------------------------------------
 
     @override
-    async def impose(self, talk: Talk, orders: Orders, change: OrderChange) -> None:
+    async def apply(self, turn: Turn, orders: Orders, change: OrderChange) -> None:
         with self.conversing():
-            await self.identify(talk)
+            await self.identify(turn)
             setpoint = clamp(orders, self.limits)
             # The user's pause goes out at once; else the box says what may be sent.
             if change.allowed is not False and not self._may_write(
-                await self.look(talk), setpoint, orders, change
+                await self.look(turn), setpoint, orders, change
             ):
                 return
             await self.enforce(
-                talk,
-                lambda: clamp(self.sought(change), self.limits),
+                turn,
+                lambda: clamp(self.order_to_send(change), self.limits),
                 starts=change.allowed is True,
             )
             self._limit_paused = setpoint.paused and orders.allowed is not False
@@ -153,18 +150,18 @@ class AblCharger(AblReader):
             return lowers
         return lowers or asked or self._fell_back
 
-    async def _assert(self, talk: Talk) -> None:
+    async def _reassert(self, turn: Turn) -> None:
         """Bring a box that stands above its orders down to them."""
         with self.conversing():
-            await self.identify(talk)
-            raw = self.raw or await self.look(talk)
-            if not self._must_assert(raw):
+            await self.identify(turn)
+            raw = self.raw or await self.look(turn)
+            if not self._must_reassert(raw):
                 # A command of the user came first and did it.
                 return
             duty = limit_duty(self.setpoint)
             if duty == self.confirmed and not is_within(raw.duty, duty):
                 self.statistics.reasserted += 1
-            await self.enforce(talk, lambda: self.setpoint)
+            await self.enforce(turn, lambda: self.setpoint)
             self._fell_back = self.orders_expired
             if self.setpoint.paused and self.effective_orders.allowed is not False:
                 self._limit_paused = True
@@ -178,4 +175,4 @@ class AblCharger(AblReader):
         value: bool | int | str | None = None,
     ) -> None:
         conversation, persistence = self._commands.conversation(command, value)
-        await self.run(in_turns(conversation), persistence=persistence)
+        await self.run(conversation, persistence=persistence)

@@ -9,6 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 
+from ..conversation import Conversation, rest
 from ..errors import (
     ExchangeRefusedError,
     NotAvailableError,
@@ -16,9 +17,8 @@ from ..errors import (
     RefusedOrderError,
     ReplyTimeoutError,
 )
-from ..exchange import Talk
+from ..exchange import Turn
 from ..model import Command, Persistence
-from ..turns import Conversation, rest
 from .dialogue import Dialogue
 from .duty import PAUSE
 from .reader import AblReader, Debt
@@ -88,14 +88,14 @@ class CommandSet(Dialogue):
     def _one_at_a_time(
         self, command: Command | None, turns: Conversation
     ) -> Conversation:
-        async def conversation(talk: Talk) -> None:
+        async def conversation(turn: Turn) -> None:
             if self._busy is not None:
                 message = f"{self._charger.config.name} is busy: {self._busy.what}"
                 raise NotAvailableError(message)
             self._busy = mine = _Busy(command or "tidying up")
             try:
                 with self._charger.conversing():
-                    await turns(talk)
+                    await turns(turn)
             finally:
                 if self._busy is mine:
                     self._busy = None
@@ -105,34 +105,34 @@ class CommandSet(Dialogue):
 
     # -- Outlet ------------------------------------------------------------------
 
-    async def _set_outlet(self, enabled: bool, talk: Talk) -> None:  # noqa: FBT001
-        await self._reach(talk)
+    async def _set_outlet(self, enabled: bool, turn: Turn) -> None:  # noqa: FBT001
+        await self._reach(turn)
         reading = self._state()
         if enabled:
             if state_of(reading.state).outlet_enabled is not True:
                 if reading.state not in (E0, E2):
                     raise self._refuse_in(reading, "only E0 and E2 can be left")
-                await self._enable(talk)
+                await self._enable(turn)
             self._charger.owes = None
         else:
-            await self._disable(talk)
+            await self._disable(turn)
 
-    async def _enable(self, talk: Talk) -> None:
+    async def _enable(self, turn: Turn) -> None:
         """Enable the outlet, with the limit that stands."""
         charger = self._charger
         paused = self._state().duty == PAUSE
-        await self._limit_first(talk)
+        await self._limit_first(turn)
         await self._reach_state(
-            talk, StateCode.A1, lambda now: now.state not in (E0, E2)
+            turn, StateCode.A1, lambda now: now.state not in (E0, E2)
         )
         if not paused and self._state().duty < limit_duty(charger.setpoint) != PAUSE:
             # Limits raised while the outlet was disabled have only been stored.
-            await charger.enforce(talk, lambda: charger.setpoint)
+            await charger.enforce(turn, lambda: charger.setpoint)
 
     # -- Waking a car ------------------------------------------------------------
 
-    async def _wake(self, talk: Talk) -> None:
-        await self._reach(talk)
+    async def _wake(self, turn: Turn) -> None:
+        await self._reach(turn)
         charger = self._charger
         reading = self._state()
         if reading.state != B2:
@@ -141,34 +141,34 @@ class CommandSet(Dialogue):
             raise self._refuse_in(reading, "charging is paused, waking would not help")
         charger.owes = Debt(StateCode.A1, E0)
         try:
-            confirmed = await self._say(talk, StateCode.E0)
+            confirmed = await self._say(turn, StateCode.E0)
         except ExchangeRefusedError:
             charger.owes = None
             raise
         if not confirmed:
             # If the state is not told either, E0 must be assumed.
             with suppress(ReplyTimeoutError):
-                if (await charger.look(talk)).state != E0:
+                if (await charger.look(turn)).state != E0:
                     charger.owes = None
                     message = f"{charger.config.name} did not take E0"
                     raise NotConfirmedError(message)
         await rest(self.pauses.wake)
-        await self._give_back(talk)
+        await self._give_back(turn)
 
-    async def give_back(self, talk: Talk) -> None:
+    async def give_back(self, turn: Turn) -> None:
         """Finish what a command that was cut short has left undone."""
-        await self._one_at_a_time(None, self._give_back)(talk)
+        await self._one_at_a_time(None, self._give_back)(turn)
 
     # -- Reset -------------------------------------------------------------------
 
-    async def _reset(self, talk: Talk) -> None:
-        await self._reach(talk)
+    async def _reset(self, turn: Turn) -> None:
+        await self._reach(turn)
         before = self._state()
         if before.state == E0:
             self._charger.owes = Debt(StateCode.E0)
-        self._hold_polls(talk)
-        confirmed = await self._say(talk, StateCode.RESET)
-        await self._after_reset(talk, was_disabled=before.state == E0)
+        self._hold_polls(turn)
+        confirmed = await self._say(turn, StateCode.RESET)
+        await self._after_reset(turn, was_disabled=before.state == E0)
         after = self._state()
         if not confirmed and (after.state, after.duty) == (before.state, before.duty):
             message = (

@@ -1,7 +1,7 @@
 """One exchange with a box: a block read, a register written."""
 
 from ..errors import ReplyTimeoutError
-from ..exchange import Talk
+from ..exchange import Turn
 from ..registers import Registers
 from ..safety import Setpoint
 from .registers import (
@@ -19,9 +19,9 @@ from .registers import (
 
 
 async def read[T](
-    talk: Talk, address: int, registers: Registers[T], *, attempts: int = 1
+    turn: Turn, address: int, registers: Registers[T], *, attempts: int = 1
 ) -> T:
-    """Return the contents of a block; raises what `Talk.exchange` raises.
+    """Return the contents of a block; raises what `Turn.exchange` raises.
 
     More than one attempt is for a box known to be awake: then a lost answer was a
     disturbance, and asking again at once helps.
@@ -30,28 +30,28 @@ async def read[T](
     answer = read_answer(address, registers.block)
     for _ in range(attempts - 1):
         try:
-            return registers.decode(await talk.exchange(request, answer))
+            return registers.decode(await turn.exchange(request, answer))
         except ReplyTimeoutError:
             continue
-    return registers.decode(await talk.exchange(request, answer))
+    return registers.decode(await turn.exchange(request, answer))
 
 
-async def set_limit(talk: Talk, address: int, setpoint: Setpoint) -> None:
+async def set_limit(turn: Turn, address: int, setpoint: Setpoint) -> None:
     """Write Icmax; also raises ExchangeRefusedError."""
-    await talk.exchange(
+    await turn.exchange(
         write_limit(address, setpoint), write_answer(address, LIMIT_REGISTER)
     )
 
 
-async def set_state(talk: Talk, address: int, code: StateCode) -> None:
+async def set_state(turn: Turn, address: int, code: StateCode) -> None:
     """Make the outlet change its state; also raises ExchangeRefusedError."""
-    await talk.exchange(
+    await turn.exchange(
         write_state(address, code), write_answer(address, STATE_REGISTER)
     )
 
 
 async def configure(
-    talk: Talk,
+    turn: Turn,
     address: int,
     device_id: int,
     *,
@@ -65,4 +65,4 @@ async def configure(
         upstream_timeout=upstream_timeout,
         needs_enable=needs_enable,
     )
-    await talk.exchange(request, write_answer(address, CONFIGURATION_REGISTER))
+    await turn.exchange(request, write_answer(address, CONFIGURATION_REGISTER))

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Final, override
 
 from ..charger import Charger
+from ..conversation import rest
 from ..errors import (
     ExchangeRefusedError,
     GarbledReplyError,
@@ -16,11 +17,10 @@ from ..errors import (
     ReplyTimeoutError,
     WrongChargerError,
 )
-from ..exchange import Talk
+from ..exchange import Turn
 from ..framing import Timing
 from ..model import Capability, ChargerConfig, Fault, Limits, Orders, Phases
 from ..safety import Setpoint
-from ..turns import rest
 from .duty import PAUSE, is_within
 from .exchanges import read, set_limit
 from .readings import (
@@ -115,12 +115,12 @@ class Debt:
         return state != E0 if self.state is None else state == self.state
 
 
-class AblReader(Charger):
+class AblReader(Charger[AblConfig]):
     """One ABL wallbox, as far as it is asked and not told."""
 
     timing = TIMING
 
-    def __init__(self, config: ChargerConfig, orders: Orders) -> None:
+    def __init__(self, config: AblConfig, orders: Orders) -> None:
         """Take the set-up; the box is not known before it answers."""
         super().__init__(config, orders)
         self.raw: Reading | None = None
@@ -141,8 +141,8 @@ class AblReader(Charger):
         self._energy = EnergyEstimate(config.poll_interval)
 
     @override
-    def set_up(self, config: ChargerConfig) -> None:
-        super().set_up(config)
+    def reconfigure(self, config: ChargerConfig) -> None:
+        super().reconfigure(config)
         self._energy.set_interval(config.poll_interval)
 
     @property
@@ -189,8 +189,8 @@ class AblReader(Charger):
         self._energy.interrupt()
 
     @override
-    def missed(self, now: float) -> None:
-        super().missed(now)
+    def on_missed(self, now: float) -> None:
+        super().on_missed(now)
         # Whoever answers next may be another one.
         self._identified = False
 
@@ -199,7 +199,7 @@ class AblReader(Charger):
         """Return the serial number that was read at this address."""
         return self._serial if self._identified else None
 
-    async def identify(self, talk: Talk) -> Info:
+    async def identify(self, turn: Turn) -> Info:
         """Make sure that the right box answers; return what it is.
 
         Raises WrongChargerError, and then nothing may be written.
@@ -207,8 +207,8 @@ class AblReader(Charger):
         if self._identified and self._info is not None:
             return self._info
         address = self.config.address
-        info = await read(talk, address, INFO)
-        serial = await self._read_serial(talk)
+        info = await read(turn, address, INFO)
+        serial = await self._read_serial(turn)
         expected = self.config.serial or self._serial
         if expected is not None and serial != expected:
             self.notice(Fault.WRONG_CHARGER, present=True)
@@ -223,14 +223,14 @@ class AblReader(Charger):
         self.info = charger_info(info, serial, self._flags)
         return info
 
-    async def _read_serial(self, talk: Talk) -> str | None:
+    async def _read_serial(self, turn: Turn) -> str | None:
         """Return the serial number; ``None`` from a box that tells none.
 
         The manual shows 0x0050 in an example only. Where no serial number is
         expected, silence is taken for a register that is not there.
         """
         try:
-            serial = await read(talk, self.config.address, SERIAL, attempts=2)
+            serial = await read(turn, self.config.address, SERIAL, attempts=2)
         except GarbledReplyError:
             raise
         except ReplyTimeoutError, ExchangeRefusedError:
@@ -241,15 +241,15 @@ class AblReader(Charger):
 
     # -- What it says ------------------------------------------------------------
 
-    async def look(self, talk: Talk) -> Reading:
+    async def look(self, turn: Turn) -> Reading:
         """Read the state anew in the midst of a conversation, and keep it."""
-        raw = await self.read_once(talk, attempts=2)
-        self.take(raw, talk.now)
+        raw = await self.read_once(turn, attempts=2)
+        self.take(raw, turn.now)
         return raw
 
-    async def read_once(self, talk: Talk, *, attempts: int = 1) -> Reading:
-        """Return what 0x002E tells; raises what `Talk.exchange` raises."""
-        return await read(talk, self.config.address, READING, attempts=attempts)
+    async def read_once(self, turn: Turn, *, attempts: int = 1) -> Reading:
+        """Return what 0x002E tells; raises what `Turn.exchange` raises."""
+        return await read(turn, self.config.address, READING, attempts=attempts)
 
     def take(self, raw: Reading, now: float) -> None:
         """Make a reading of what was told."""
@@ -259,10 +259,7 @@ class AblReader(Charger):
         snapshot = Snapshot(
             reading=raw, info=self._info, flags=self._flags, icmax=self._icmax
         )
-        order = (
-            self.config.phase_order if isinstance(self.config, AblConfig) else (1, 2, 3)
-        )
-        currents = phase_currents(snapshot, order)
+        currents = phase_currents(snapshot, self.config.phase_order)
         power = power_of(currents, self.config.voltage)
         self._energy.add(power, now)
         energy = self._energy.energy if self._info.meter else None
@@ -272,41 +269,41 @@ class AblReader(Charger):
         if changed:
             self.updated()
 
-    async def read_flags_if_due(self, talk: Talk, raw: Reading) -> None:
+    async def read_flags_if_due(self, turn: Turn, raw: Reading) -> None:
         """Read the flags from time to time, and when the state is another one."""
         known = self.raw
         if (
             known is None
             or (known.state, known.reduced) != (raw.state, raw.reduced)
-            or talk.now >= self._flags_due
+            or turn.now >= self._flags_due
         ):
-            await self.read_flags(talk)
+            await self.read_flags(turn)
 
-    async def read_flags(self, talk: Talk) -> None:
+    async def read_flags(self, turn: Turn) -> None:
         """Read the flags; without an answer the old ones count for a while."""
         try:
-            self._flags = await read(talk, self.config.address, FLAGS)
+            self._flags = await read(turn, self.config.address, FLAGS)
             if self.tells_icmax:
-                icmax = await read(talk, self.config.address, ICMAX)
+                icmax = await read(turn, self.config.address, ICMAX)
                 self._icmax = icmax.duty
         except ReplyTimeoutError, ExchangeRefusedError:
             self._flags_missed += 1
             if self._flags_missed >= FLAGS_MISSES:
                 self._flags = None
                 self._icmax = None
-                self._flags_due = talk.now + FLAGS_INTERVAL
+                self._flags_due = turn.now + FLAGS_INTERVAL
             return
         self._flags_missed = 0
-        self._flags_due = talk.now + FLAGS_INTERVAL
+        self._flags_due = turn.now + FLAGS_INTERVAL
         if self._info is not None:
             self.info = charger_info(self._info, self._serial, self._flags)
 
-    async def look_for_icmax(self, talk: Talk) -> None:
+    async def look_for_icmax(self, turn: Turn) -> None:
         """Find out whether the box knows a register that the manual omits."""
         # Silence is its answer for "no", and no miss.
         self.tells_icmax = False
         try:
-            icmax = await read(talk, self.config.address, ICMAX)
+            icmax = await read(turn, self.config.address, ICMAX)
         except ReplyTimeoutError, ExchangeRefusedError:
             return
         self.tells_icmax = True
@@ -315,7 +312,7 @@ class AblReader(Charger):
     # -- What is written -------------------------------------------------------------
 
     async def enforce(
-        self, talk: Talk, wanted: Callable[[], Setpoint], *, starts: bool = False
+        self, turn: Turn, wanted: Callable[[], Setpoint], *, starts: bool = False
     ) -> None:
         """Write a set-point until it is read back, at it or below it.
 
@@ -329,12 +326,12 @@ class AblReader(Charger):
             setpoint = wanted()
             duty = limit_duty(setpoint)
             try:
-                await set_limit(talk, self.config.address, setpoint)
+                await set_limit(turn, self.config.address, setpoint)
             except ExchangeRefusedError:
                 self.notice(Fault.LIMIT_NOT_TAKEN, present=True)
                 raise
             for pause in (SETTLING, None):
-                raw = await self.look(talk)
+                raw = await self.look(turn)
                 still_paused = starts and raw.duty == PAUSE != duty
                 if is_within(raw.duty, duty) and not still_paused:
                     self.confirmed = duty

@@ -8,12 +8,12 @@ from typing import Final
 
 from ..bus import Bus
 from ..errors import GarbledReplyError, LineBusyError, ReplyTimeoutError
-from ..exchange import Talk
-from ..found import FoundCharger, ScanReport
+from ..exchange import Turn
 from ..modbus import ModbusFrame
 from ..model import ChargerConfig, Orders
 from ..protocol import Progress
 from ..readings import ChargerInfo
+from ..scan import FoundCharger, ScanResult
 from .exchanges import read
 from .readings import charger_info
 from .registers import (
@@ -64,7 +64,7 @@ class _Scan:
     )
     asked: list[_Asked] = field(default_factory=list)
 
-    async def run(self, progress: Progress) -> ScanReport:
+    async def run(self, progress: Progress) -> ScanResult:
         """Ask one ID after the other; those that stay silent again, in their time."""
         loop = asyncio.get_running_loop()
         while self.waiting:
@@ -91,7 +91,7 @@ class _Scan:
         except LineBusyError:
             one.busy += 1
 
-    def _report(self) -> ScanReport:
+    def _report(self) -> ScanResult:
         """Return what was found, addresses in order."""
         self.asked.sort(key=lambda one: one.address)
         found = tuple(one.found for one in self.asked if one.found is not None)
@@ -101,25 +101,25 @@ class _Scan:
             if one.found is None and one.garbled >= ASKED
         )
         if not found and len(garbled) > FEW:
-            return ScanReport(unreadable=True)
-        return ScanReport(found=found, duplicates=garbled)
+            return ScanResult(unreadable=True)
+        return ScanResult(found=found, duplicates=garbled)
 
 
-async def _ask_info(address: int, talk: Talk) -> ChargerInfo:
+async def _ask_info(address: int, turn: Turn) -> ChargerInfo:
     """Return what a box at this address is.
 
     Two equal boxes may answer this as one; their serial numbers differ, so that
     answer is then unreadable, or there are two. Raises GarbledReplyError for both.
     """
-    info = await read(talk, address, INFO)
-    serials = await _listen_for_serials(talk, address)
+    info = await read(turn, address, INFO)
+    serials = await _listen_for_serials(turn, address)
     if len(serials) > 1:
         message = f"device-ID {address} has {len(serials)} serial numbers"
         raise GarbledReplyError(message)
     return charger_info(info, serials.pop() if serials else None, None)
 
 
-async def _listen_for_serials(talk: Talk, address: int) -> set[str | None]:
+async def _listen_for_serials(turn: Turn, address: int) -> set[str | None]:
     """Return every serial number told at an address; none: it has no such register.
 
     Nothing is taken for the answer, so that a second box which is a little slower
@@ -135,7 +135,7 @@ async def _listen_for_serials(talk: Talk, address: int) -> set[str | None]:
     garbled: GarbledReplyError | None = None
     for _ in range(ASKED):
         try:
-            await talk.exchange(read_request(address, SERIAL.block), collect)
+            await turn.exchange(read_request(address, SERIAL.block), collect)
         except GarbledReplyError as error:
             garbled = error
         except ReplyTimeoutError:
@@ -149,7 +149,7 @@ async def _listen_for_serials(talk: Talk, address: int) -> set[str | None]:
 
 async def scan(
     bus: Bus, config: ChargerConfig, orders: Orders, progress: Progress
-) -> ScanReport:
+) -> ScanResult:
     """Look for boxes at all device-IDs; nothing is written.
 
     ``config`` and ``orders`` are not needed: every box can be read without setting

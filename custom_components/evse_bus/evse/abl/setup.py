@@ -5,9 +5,10 @@ been told from all others by its serial number before (PROTOCOLS.md, 2).
 """
 
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
+from ..conversation import rest
 from ..errors import (
     DuplicateAddressError,
     EvseError,
@@ -15,8 +16,7 @@ from ..errors import (
     NotConfirmedError,
     ReplyTimeoutError,
 )
-from ..exchange import Talk
-from ..turns import rest
+from ..exchange import Turn
 from .dialogue import BOOT_LOOKS, Dialogue
 from .exchanges import configure, read
 from .reader import Debt
@@ -36,10 +36,10 @@ class Settings:
 class SetUp(Dialogue):
     """The conversation that sets a box up."""
 
-    async def run(self, settings: Settings, talk: Talk) -> None:
+    async def run(self, settings: Settings, turn: Turn) -> None:
         """Set device-ID or settings: E2, 0x002C, reset; then see that it is so."""
         charger = self._charger
-        await self._reach(talk)
+        await self._reach(turn)
         old = charger.config.address
         new = old if settings.device_id is None else settings.device_id
         if settings.device_id == old:
@@ -47,20 +47,20 @@ class SetUp(Dialogue):
         before = self._state()
         serial = self._check_ready(before)
         if new != old:
-            await self._make_sure_free(talk, new)
+            await self._make_sure_free(turn, new)
         was_disabled = before.state == E0
         charger.owes = Debt(StateCode.E0) if was_disabled else Debt(StateCode.A1, E2)
         try:
-            await self._write(talk, settings, new)
+            await self._write(turn, settings, new)
         except EvseError:
             # Out of the set-up mode again, whatever went wrong.
             with suppress(EvseError):
-                await self._give_back(talk)
+                await self._give_back(turn)
             raise
         charger.forget()
-        await self._move(talk, new, serial)
-        await self._after_reset(talk, was_disabled=was_disabled)
-        await charger.read_flags(talk)
+        await self._move(turn, new, serial)
+        await self._after_reset(turn, was_disabled=was_disabled)
+        await charger.read_flags(turn)
         self._check_settings(settings)
 
     def _check_ready(self, reading: Reading) -> str:
@@ -78,7 +78,7 @@ class SetUp(Dialogue):
             raise NotAvailableError(message)
         return serial
 
-    async def _make_sure_free(self, talk: Talk, address: int) -> None:
+    async def _make_sure_free(self, turn: Turn, address: int) -> None:
         """Raise DuplicateAddressError when somebody has that address already."""
         bus = self._charger.bus
         others = bus.chargers.values() if bus is not None else ()
@@ -87,7 +87,7 @@ class SetUp(Dialogue):
             if taken:
                 break
             with suppress(ReplyTimeoutError):
-                await read(talk, address, INFO)
+                await read(turn, address, INFO)
                 taken = True
             if not ask:
                 # A box asleep loses the first request.
@@ -96,15 +96,15 @@ class SetUp(Dialogue):
             message = f"device-ID {address} is taken already"
             raise DuplicateAddressError(message)
 
-    async def _write(self, talk: Talk, settings: Settings, new: int) -> None:
-        self._hold_polls(talk)
-        await self._reach_state(talk, StateCode.E2, lambda now: now.state == E2)
-        self._hold_polls(talk)
+    async def _write(self, turn: Turn, settings: Settings, new: int) -> None:
+        self._hold_polls(turn)
+        await self._reach_state(turn, StateCode.E2, lambda now: now.state == E2)
+        self._hold_polls(turn)
         await rest(self.pauses.setup)
-        self._hold_polls(talk)
+        self._hold_polls(turn)
         write = partial(
             configure,
-            talk,
+            turn,
             self._charger.config.address,
             new,
             upstream_timeout=settings.upstream_timeout,
@@ -116,25 +116,25 @@ class SetUp(Dialogue):
             # It cannot be read before the reset; the same value twice is the same.
             await write()
         await rest(self.pauses.setup)
-        self._hold_polls(talk)
-        if not await self._say(talk, StateCode.RESET):
+        self._hold_polls(turn)
+        if not await self._say(turn, StateCode.RESET):
             with suppress(ReplyTimeoutError):
-                if (await self._charger.look(talk)).state == E2:
-                    await self._say(talk, StateCode.RESET)
+                if (await self._charger.look(turn)).state == E2:
+                    await self._say(turn, StateCode.RESET)
 
-    async def _move(self, talk: Talk, new: int, serial: str) -> None:
+    async def _move(self, turn: Turn, new: int, serial: str) -> None:
         """Find the box at its new address, by its serial number; then go there."""
         charger = self._charger
         if new == charger.config.address:
             return
         for _ in range(BOOT_LOOKS):
-            self._hold_polls(talk)
+            self._hold_polls(turn)
             await rest(self.pauses.boot)
-            self._hold_polls(talk)
+            self._hold_polls(turn)
             with suppress(ReplyTimeoutError):
-                found = await read(talk, new, SERIAL)
+                found = await read(turn, new, SERIAL)
                 if found.number == serial:
-                    charger.config = replace(charger.config, address=new)
+                    charger.move(new)
                     return
         message = (
             f"{charger.config.name} was not found at device-ID {new}; "

@@ -2,20 +2,14 @@
 
 from typing import Final
 
-from ..charger import Charger
-from ..model import ChargerConfig, Orders
 from ..protocol import Protocol
 from .charger import EvboxCharger
-from .config import EvboxConfig, evbox_config
+from .config import EvboxConfig
 from .frames import EvboxFramer
 from .scan import scan
 from .timing import SETTINGS, TIMING
 
 __all__ = ["PROTOCOL", "EvboxCharger", "EvboxConfig"]
-
-
-def _charger(config: ChargerConfig, orders: Orders) -> Charger:
-    return EvboxCharger(evbox_config(config), orders)
 
 
 PROTOCOL: Final = Protocol(
@@ -25,7 +19,7 @@ PROTOCOL: Final = Protocol(
     timing=TIMING,
     framer=EvboxFramer,
     config=EvboxConfig,
-    charger=_charger,
+    charger=EvboxCharger,
     scan=scan,
-    probe_imposes=True,
+    probe_sets_limits=True,
 )

@@ -22,10 +22,11 @@ What this takes from the manual, and where it chooses (PROTOCOLS.md section 1):
 from collections.abc import Callable
 import logging
 from math import inf
-from typing import TYPE_CHECKING, Final, override
+from typing import Final, override
 
 from ..charger import Charger
 from ..errors import GarbledReplyError, ImplausibleReplyError, WrongChargerError
+from ..exchange import Turn
 from ..model import Capability, Fault, Limits, OrderChange, Orders
 from ..readings import ChargerReading
 from ..safety import INTERVALS_PER_TIMEOUT, Setpoint
@@ -37,9 +38,6 @@ from .plausibility import Plausibility, Taken, used_currents
 from .reading import charger_info, connectors, same_serial, serial_number
 from .request import effective_timeout, encode, wire_setpoint
 from .timing import FOLLOW_TIME, INTERVAL_MARGIN, TIMING
-
-if TYPE_CHECKING:
-    from ..exchange import Talk
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -67,7 +65,7 @@ _NOTICED_FROM: Final = 2
 """Implausible replies in a row from which it is a fault, not a stray frame."""
 
 
-class EvboxCharger(Charger):
+class EvboxCharger(Charger[EvboxConfig]):
     """One ChargePoint with its 0 to 20 ChargeBox modules."""
 
     timing = TIMING
@@ -76,7 +74,6 @@ class EvboxCharger(Charger):
     def __init__(self, config: EvboxConfig, orders: Orders) -> None:
         """Take the orders that stand; the first poll imposes them, up to 6 A."""
         super().__init__(config, orders)
-        self._evbox = config
         self._believed = Plausibility()
         self._watch = LimitWatch()
         self._serial = config.serial
@@ -97,7 +94,7 @@ class EvboxCharger(Charger):
     @override
     def capabilities(self) -> frozenset[Capability]:
         """Return what this command tells and sets; the wire has no status."""
-        return _ALWAYS | _BY_COMMAND[self._evbox.command]
+        return _ALWAYS | _BY_COMMAND[self.config.command]
 
     @property
     @override
@@ -141,7 +138,7 @@ class EvboxCharger(Charger):
     @override
     def longest_request(self) -> int:
         """Return the bytes of a request."""
-        return LONGEST_REQUEST[self._evbox.command]
+        return LONGEST_REQUEST[self.config.command]
 
     @override
     def on_line_open(self) -> None:
@@ -154,25 +151,25 @@ class EvboxCharger(Charger):
     # -- The conversation --------------------------------------------------------
 
     @override
-    async def poll(self, talk: Talk) -> None:
+    async def poll(self, turn: Turn) -> None:
         """Impose what stands, and take the reading that answers it."""
-        await self._converse(talk, lambda: self.effective_orders)
+        await self._converse(turn, lambda: self.effective_orders)
 
     @override
-    async def impose(self, talk: Talk, orders: Orders, change: OrderChange) -> None:
+    async def apply(self, turn: Turn, orders: Orders, change: OrderChange) -> None:
         """Send these orders; a believed answer confirms them."""
         try:
-            await self._converse(talk, lambda: self.sought(change))
+            await self._converse(turn, lambda: self.order_to_send(change))
         except ImplausibleReplyError as error:
             # Said again, it is believed at last: let the bus repeat it.
             self.statistics.implausible += 1
-            self.plan(talk.now)
-            self._after_retry(talk.now)
+            self.plan(turn.now)
+            self._after_retry(turn.now)
             raise GarbledReplyError(str(error)) from error
-        self.heard(talk.now)
-        self.plan(talk.now)
+        self.on_reply(turn.now)
+        self.plan(turn.now)
 
-    async def _converse(self, talk: Talk, orders: Callable[[], Orders]) -> None:
+    async def _converse(self, turn: Turn, orders: Callable[[], Orders]) -> None:
         """Impose the orders that count when the line is quiet; take the answer."""
         if self._wrong is not None:
             raise self._wrong
@@ -181,26 +178,26 @@ class EvboxCharger(Charger):
         def request() -> bytes:
             nonlocal setpoint
             setpoint = self._setpoint(orders())
-            return encode(self._evbox, setpoint)
+            return encode(self.config, setpoint)
 
         reply = None
         try:
-            reply = await talk.exchange(request, self._accept)
+            reply = await turn.exchange(request, self._accept)
         finally:
-            if talk.sent_at is not None and setpoint is not None:
-                self._note_sent(talk.sent_at, setpoint, answered=reply is not None)
-                pause = self.minimum_pause(talk.now)
-                self.slot.ready = max(self.slot.ready, talk.now + pause)
+            if turn.sent_at is not None and setpoint is not None:
+                self._note_sent(turn.sent_at, setpoint, answered=reply is not None)
+                pause = self.minimum_pause(turn.now)
+                self.slot.ready = max(self.slot.ready, turn.now + pause)
         # Whatever it says, the box is there.
         self.misses = 0
         self.slot.kind = Kind.POLL
         self._check_identity(reply)
         try:
-            taken = self._believed.take(reply, talk.now)
+            taken = self._believed.take(reply, turn.now)
         except ImplausibleReplyError:
             self._hold_back()
             raise
-        self._take(taken, talk.now)
+        self._take(taken, turn.now)
         self._outdated = setpoint != self._setpoint(orders())
 
     def _setpoint(self, orders: Orders) -> Setpoint:
@@ -209,9 +206,9 @@ class EvboxCharger(Charger):
     def _accept(self, frame: EvboxFrame) -> Reply | None:
         """Return the reply to our request; ``None``: somebody else's frame."""
         reply = decode_reply(frame)
-        if reply is None or reply.command != self._evbox.command:
+        if reply is None or reply.command != self.config.command:
             return None
-        addressed = self._evbox.addressed
+        addressed = self.config.addressed
         if addressed and reply.serial != f"{addressed:08d}":
             # Another ChargePoint answers another SmartGrid module.
             return None
@@ -286,7 +283,7 @@ class EvboxCharger(Charger):
     def _details(self, taken: Taken) -> dict[str, str | int | float | bool | None]:
         sent = self._sent
         return {
-            "command": self._evbox.command,
+            "command": self.config.command,
             "modules": len(taken.reply.modules),
             "told_maximum_current": taken.reply.maximum_current,
             "ordered_timeout": self.effective_orders.fail_safe_timeout,
@@ -341,9 +338,9 @@ class EvboxCharger(Charger):
         slot.start_by = max(slot.start_by, slot.ready)
 
     @override
-    def missed(self, now: float) -> None:
+    def on_missed(self, now: float) -> None:
         """Retry after the minimum interval, and still before the time-out."""
-        super().missed(now)
+        super().on_missed(now)
         if self._wrong is not None:
             self._stop()
         elif self.available and self._deadline >= self.slot.ready:

@@ -35,11 +35,3 @@ class EvboxConfig(ChargerConfig):
     def addressed(self) -> int:
         """Return the serial number that is addressed; 0: whoever is there."""
         return self.address if self.command == 68 else ANY_SERIAL  # noqa: PLR2004
-
-
-def evbox_config(config: ChargerConfig) -> EvboxConfig:
-    """Return the set-up as this protocol's own; TypeError for another one's."""
-    if not isinstance(config, EvboxConfig):
-        message = f"{config.name} is not set up as an EVBox"
-        raise TypeError(message)
-    return config

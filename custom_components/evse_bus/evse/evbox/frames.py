@@ -6,20 +6,17 @@ characters, not over the bytes they stand for (PROTOCOLS.md section 1: only so
 the manual's command 69 request gives its printed F703).
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from operator import xor
 from string import hexdigits
-from typing import TYPE_CHECKING, Final, Literal, override
+from typing import Final, Literal, override
 
 from ..errors import GarbledReplyError
 from ..framing import Frame, Framer
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from ..model import Phases
-    from ..safety import Setpoint
+from ..model import Phases
+from ..safety import Setpoint
 
 type CommandNumber = Literal[68, 69]
 

@@ -12,22 +12,20 @@ and their serial numbers have to be typed.
 import asyncio
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from ..bus import Bus
 from ..errors import GarbledReplyError, RefusedOrderError, ReplyTimeoutError
-from ..found import FoundCharger, ScanReport
-from ..model import ChargerConfig, Limits, Orders
-from .config import EvboxConfig, evbox_config
+from ..exchange import Turn
+from ..model import Limits, Orders
+from ..protocol import Progress
+from ..scan import FoundCharger, ScanResult
+from .config import EvboxConfig
 from .frames import ANY_SERIAL, EvboxFrame, Reply, decode_reply
 from .plausibility import range_oddities
 from .reading import charger_info, serial_number
 from .request import encode, wire_setpoint
 from .timing import INTERVAL_MARGIN, UNKNOWN_INTERVAL
-
-if TYPE_CHECKING:
-    from ..bus import Bus
-    from ..exchange import Talk
-    from ..protocol import Progress
 
 TRIES: Final = 2
 RETRY_PAUSE = UNKNOWN_INTERVAL + INTERVAL_MARGIN
@@ -52,32 +50,31 @@ class _Heard:
 
 
 async def scan(
-    bus: Bus, config: ChargerConfig, orders: Orders, progress: Progress
-) -> ScanReport:
+    bus: Bus, config: EvboxConfig, orders: Orders, progress: Progress
+) -> ScanResult:
     """Impose these orders on whoever is addressed, and report who answers.
 
     Takes one second where somebody answers, 23 s where nobody does. Raises
     RefusedOrderError for orders that cannot be sent, and for a probe of everybody
     on a bus that has chargers already; LineError when the line will not do.
     """
-    evbox = evbox_config(config)
-    if evbox.addressed == ANY_SERIAL and bus.chargers:
+    if config.addressed == ANY_SERIAL and bus.chargers:
         message = (
             "a search would set the limits of the chargers already on this bus: "
             "type the serial number of the new one"
         )
         raise RefusedOrderError(message)
-    limits = Limits(installation=evbox.installation_limit, reports_maximum=True)
-    request = encode(evbox, wire_setpoint(orders, limits, UNKNOWN_INTERVAL))
+    limits = Limits(installation=config.installation_limit, reports_maximum=True)
+    request = encode(config, wire_setpoint(orders, limits, UNKNOWN_INTERVAL))
     heard = _Heard()
     for number in range(TRIES):
         if number:
             await _pause(progress)
-        heard = await bus.run(partial(_probe, bus, evbox, request))
+        heard = await bus.run(partial(_probe, bus, config, request))
         if heard.replies:
             break
     progress(1.0)
-    return _report(evbox, heard)
+    return _report(config, heard)
 
 
 async def _pause(progress: Progress) -> None:
@@ -88,7 +85,7 @@ async def _pause(progress: Progress) -> None:
         await asyncio.sleep(min(_PROGRESS_STEP, RETRY_PAUSE - passed))
 
 
-async def _probe(bus: Bus, config: EvboxConfig, request: bytes, talk: Talk) -> _Heard:
+async def _probe(bus: Bus, config: EvboxConfig, request: bytes, turn: Turn) -> _Heard:
     heard = _Heard()
 
     def collect(frame: EvboxFrame) -> None:
@@ -105,7 +102,7 @@ async def _probe(bus: Bus, config: EvboxConfig, request: bytes, talk: Talk) -> _
     bad = bus.wire.statistics.bad_frames
     try:
         # Nothing is taken for the answer: whoever else has one to give is waited for.
-        await talk.exchange(request, collect)
+        await turn.exchange(request, collect)
     except GarbledReplyError:
         if bus.wire.statistics.bad_frames > bad:
             heard.bad_frames = True
@@ -116,7 +113,7 @@ async def _probe(bus: Bus, config: EvboxConfig, request: bytes, talk: Talk) -> _
     return heard
 
 
-def _report(config: EvboxConfig, heard: _Heard) -> ScanReport:
+def _report(config: EvboxConfig, heard: _Heard) -> ScanResult:
     found: dict[int, FoundCharger] = {}
     duplicates: set[int] = set()
     for reply in heard.replies:
@@ -127,7 +124,7 @@ def _report(config: EvboxConfig, heard: _Heard) -> ScanReport:
             found[address] = _found(address, reply)
     if heard.bad_frames and config.addressed == ANY_SERIAL:
         duplicates.add(ANY_SERIAL)
-    return ScanReport(
+    return ScanResult(
         found=tuple(found[address] for address in sorted(found.keys() - duplicates)),
         duplicates=tuple(sorted(duplicates)),
         unreadable=heard.unreadable,

@@ -9,6 +9,7 @@ from .config import EwsPortConfig
 from .frames import EwsFramer
 from .listener import Listener, Stranger
 from .scan import scan
+from .session import Ports
 from .timing import SETTINGS, TCP_TIMING, TIMING
 
 PROTOCOL: Final = Protocol(
@@ -21,6 +22,7 @@ PROTOCOL: Final = Protocol(
     charger=EwsPort,
     scan=scan,
     ports=2,
+    group=Ports,
 )
 """On RS-232."""
 

@@ -9,14 +9,14 @@ from contextlib import suppress
 from math import inf
 from typing import override
 
+from ..conversation import FollowUp, nothing, rest
 from ..errors import (
     EvseError,
     ImplausibleReplyError,
     NotAvailableError,
 )
-from ..exchange import Talk
+from ..exchange import Turn
 from ..framing import Frame
-from ..jobs import Later
 from ..model import (
     ChargerConfig,
     Command,
@@ -24,25 +24,24 @@ from ..model import (
     Orders,
 )
 from ..safety import clamp
-from ..turns import in_turns, rest
 from .commanding import conversation
-from .config import ews_config
+from .config import EwsPortConfig
 from .frames import EwsFrame
 from .info import decode_info
 from .reader import EwsReader
 from .services import Services
 from .session import EwsBox
 from .timing import (
-    ASSERT_PAUSE,
     FRESH,
     INFO_PAUSE,
+    REASSERT_PAUSE,
 )
 
 
 class EwsPort(EwsReader):
     """One port; all ports of a bus are of one box."""
 
-    def __init__(self, config: ChargerConfig, orders: Orders) -> None:
+    def __init__(self, config: EwsPortConfig, orders: Orders) -> None:
         """Take the set-up; the box is not known before it answers."""
         super().__init__(config, orders)
         self.services = Services(self)
@@ -55,103 +54,101 @@ class EwsPort(EwsReader):
         self._urgent_waits = False
 
     @override
-    def set_up(self, config: ChargerConfig) -> None:
-        zone = ews_config(config).time_zone
-        if zone != ews_config(self.config).time_zone:
-            self.box.check_clock()
+    def reconfigure(self, config: ChargerConfig) -> None:
+        zone = self.config.time_zone
         # A lower limit does not wait because something else has failed just now.
-        self._assert_after = -inf
-        super().set_up(config)
+        self._reassert_after = -inf
+        super().reconfigure(config)
+        if self.config.time_zone != zone:
+            self.box.check_clock()
 
     # -- The regular exchange ------------------------------------------------------
 
     @override
-    async def poll(self, talk: Talk) -> Later[None] | None:
+    async def poll(self, turn: Turn) -> FollowUp | None:
         box = self.box
         if not box.known or box.installation is None:
-            return await in_turns(self._meet)(talk)
+            await self.ready(turn)
+            self.hurry()
+            return None
         try:
-            await box.refresh(talk, talk.now - FRESH * self.config.poll_interval)
+            await box.refresh(turn, turn.now - FRESH * self.config.poll_interval)
         except ImplausibleReplyError:
             self.hold_back()
             raise
         self.take()
-        return self._what_now(talk.now)
-
-    async def _meet(self, talk: Talk) -> None:
-        await self.ready(talk)
-        self.hurry()
+        return self._next_action(turn.now)
 
     # -- What must be so ---------------------------------------------------------------
 
-    def _what_now(self, now: float) -> Later[None] | None:
+    def _next_action(self, now: float) -> FollowUp | None:
         """Return what must be said because of a reading."""
         if self.busy:
             return None
         self.limiter.check()
         # A car that must not charge is never waited for.
         if not self.permission.must_pause(self.setpoint) and (
-            now < self._assert_after or not self._must_tend(now)
+            now < self._reassert_after or not self._must_maintain(now)
         ):
             return None
-        return Later(0.0, in_turns(self._tend))
+        return FollowUp(self._maintain)
 
-    def _must_tend(self, now: float) -> bool:
+    def _must_maintain(self, now: float) -> bool:
         box = self.box
-        zone = ews_config(self.config).time_zone
+        zone = self.config.time_zone
         return (
-            self.limiter.must_assert()
+            self.limiter.must_reassert()
             or now >= box.parameters_due
             or box.clock_is_wrong(zone, now)
         )
 
-    async def _tend(self, talk: Talk) -> None:
+    async def _maintain(self, turn: Turn) -> None:
         with self.conversing():
             # Not again at once, whatever comes of it.
-            self._assert_after = talk.now + ASSERT_PAUSE
-            await self._assert(talk)
-        self._assert_after = -inf
+            self._reassert_after = turn.now + REASSERT_PAUSE
+            await self._reassert(turn)
+        self._reassert_after = -inf
 
-    async def _assert(self, talk: Talk) -> None:
+    async def _reassert(self, turn: Turn) -> None:
         if self.permission.must_pause(self.setpoint):
             ours = self.effective_orders.allowed is not False
-            await self.permission.pause(talk, for_current=ours)
+            await self.permission.pause(turn, for_current=ours)
             await rest(0.0)
-        if self.limiter.must_assert():
+        if self.limiter.must_reassert():
             self.limiter.count()
-            await self.limiter.enforce(talk, lambda: self.effective_orders)
+            await self.limiter.enforce(turn, lambda: self.effective_orders)
             await rest(0.0)
-        await self.ready(talk)
+        await self.ready(turn)
         box = self.box
-        if talk.now >= box.parameters_due:
-            await box.read_parameters(talk)
-            await self.ready(talk)
-        zone = ews_config(self.config).time_zone
-        if zone is not None and box.clock_is_wrong(zone, talk.now):
-            await box.set_clock(talk, zone)
+        if turn.now >= box.parameters_due:
+            await box.read_parameters(turn)
+            await self.ready(turn)
+        zone = self.config.time_zone
+        if zone is not None and box.clock_is_wrong(zone, turn.now):
+            await box.set_clock(turn, zone)
 
     # -- Orders ------------------------------------------------------------------------
 
     @override
-    async def impose(self, talk: Talk, orders: Orders, change: OrderChange) -> None:
+    async def apply(self, turn: Turn, orders: Orders, change: OrderChange) -> None:
         with self.conversing():
-            await self.ready(talk)
-            if clamp(self.sought(change), self.limits).paused:
-                ours = self.sought(change).allowed is not False
-                await self.permission.pause(talk, for_current=ours)
+            await self.ready(turn)
+            if clamp(self.order_to_send(change), self.limits).paused:
+                ours = self.order_to_send(change).allowed is not False
+                await self.permission.pause(turn, for_current=ours)
                 self._check_possible(change)
                 return
-            await self.limiter.enforce(talk, lambda: self.sought(change))
+            await self.limiter.enforce(turn, lambda: self.order_to_send(change))
             if not self.permission.may_start(change):
                 return
 
             def still() -> bool:
                 # Not where a pause came meanwhile: that one is on its way.
-                return not clamp(self.sought(change), self.limits).paused
+                return not clamp(self.order_to_send(change), self.limits).paused
 
             await rest(0.0)
             await self.permission.start(
-                talk, still, for_current=change.allowed is not True
+                turn, still, for_current=change.allowed is not True
             )
 
     def _check_possible(self, change: OrderChange) -> None:
@@ -171,16 +168,16 @@ class EwsPort(EwsReader):
     async def command(
         self, command: Command, value: bool | int | str | None = None
     ) -> None:
-        talks = conversation(self, command, value)
-        if talks is None:
+        commanded = conversation(self, command, value)
+        if commanded is None:
             await super().command(command, value)
             return
-        await self.run(in_turns(talks))
+        await self.run(commanded)
 
     # -- What it says unasked ------------------------------------------------------------
 
     @override
-    def on_unsolicited(self, frame: Frame) -> Later[None] | None:
+    def on_unsolicited(self, frame: Frame) -> FollowUp | None:
         if not isinstance(frame, EwsFrame):
             return None
         try:
@@ -192,7 +189,7 @@ class EwsPort(EwsReader):
         # The first port that is asked hears it for both.
         self.box.hear(info)
         if self._urgent_waits:
-            return Later(0.0, _nothing)
+            return FollowUp(nothing)
         self._urgent_waits = True
         now = self.bus.now
         pause = max(0.0, self._urgent_at + INFO_PAUSE - now)
@@ -200,21 +197,23 @@ class EwsPort(EwsReader):
         for other in self.bus.chargers.values():
             if isinstance(other, EwsPort):
                 other.hurry(self._urgent_at)
-        return Later(pause, self._urgent)
+        return FollowUp(self._urgent, pause)
 
-    async def _urgent(self, talk: Talk) -> Later[None] | None:
+    async def _urgent(self, turn: Turn) -> None:
         """Poll out of turn."""
         self._urgent_waits = False
         try:
-            later = await self.poll(talk)
+            follow_up = await self.poll(turn)
         except EvseError:
             # The regular poll is due as well, and finds the same.
             self.box.ports_at = -inf
             raise
-        self.heard(talk.now)
-        self.plan(talk.now)
+        self.on_reply(turn.now)
+        self.plan(turn.now)
         self._tell_others()
-        return later
+        if follow_up is not None:
+            await rest()
+            await follow_up.conversation(turn)
 
     def _tell_others(self) -> None:
         """Let the other port take what the box told: its own turn may be far away."""
@@ -224,10 +223,6 @@ class EwsPort(EwsReader):
             if other is not self and isinstance(other, EwsPort) and other.available:
                 with suppress(EvseError):
                     other.take()
-
-
-async def _nothing(_talk: Talk) -> None:
-    """Do nothing: another job has it already."""
 
 
 __all__ = ["EwsBox", "EwsPort"]

@@ -11,6 +11,7 @@ from functools import partial
 from math import inf
 from typing import TYPE_CHECKING, Final
 
+from ..conversation import Conversation, rest
 from ..errors import (
     NotAvailableError,
     NotConfirmedError,
@@ -18,9 +19,8 @@ from ..errors import (
     ReplyTimeoutError,
     SupersededError,
 )
-from ..exchange import Talk
+from ..exchange import Turn
 from ..model import Capability, Command
-from ..turns import Conversation, rest
 from .answers import decode_reset
 from .commands import reset, start_stop, unlock
 from .frames import CommandId, Request
@@ -109,44 +109,44 @@ def conversation(
     return None if order is None else partial(_give, port, command, order)
 
 
-async def _give(port: EwsReader, command: Command, order: _Order, talk: Talk) -> None:
+async def _give(port: EwsReader, command: Command, order: _Order, turn: Turn) -> None:
     """Give an order, and look until it is followed.
 
     Raises NotAvailableError where it may not be given, EwsRefusedError, and
     NotConfirmedError when the port does not follow.
     """
     tries = sends = 0
-    patience = talk.now + SETTLING
+    patience = turn.now + SETTLING
     until, answered = -inf, True
     while True:
-        await port.ready(talk)
+        await port.ready(turn)
         if order.unlocks and Capability.LOCK not in port.capabilities:
             message = f"{port.config.name} has no lock"
             raise NotAvailableError(message)
         try:
-            seen = await port.look_now(talk)
+            seen = await port.look_now(turn)
         except ReplyTimeoutError:
-            if talk.now >= max(until, patience):
+            if turn.now >= max(until, patience):
                 raise
             await rest(LOOK_AGAIN)
             continue
         if order.done(seen) and (sends or order.unlocks):
             break
-        if talk.now >= until or not (answered or order.unlocks):
+        if turn.now >= until or not (answered or order.unlocks):
             if sends == order.sends or tries == TRIES:
                 message = f"{port.config.name} does not follow: {command}"
                 raise NotConfirmedError(message)
             tries += 1
             with suppress(SupersededError):
-                answered = await _say(port, order.pick(seen), seen, talk)
+                answered = await _say(port, order.pick(seen), seen, turn)
                 sends += 1
-                until = talk.now + SETTLING
+                until = turn.now + SETTLING
         await rest(LOOK_AGAIN)
     if order.unlocks and sends:
         port.permission.forget()
 
 
-async def _say(port: EwsReader, order: StartStop, seen: PortStatus, talk: Talk) -> bool:
+async def _say(port: EwsReader, order: StartStop, seen: PortStatus, turn: Turn) -> bool:
     """Say it; return whether it was answered.
 
     Raises SupersededError, and says nothing, when a record has come since the look.
@@ -162,7 +162,7 @@ async def _say(port: EwsReader, order: StartStop, seen: PortStatus, talk: Talk) 
         return make(port.port, seen=seen)
 
     try:
-        await port.box.tell(talk, CommandId.START_STOP, request)
+        await port.box.tell(turn, CommandId.START_STOP, request)
     except ReplyTimeoutError:
         return False
     if order is StartStop.STOP:
@@ -170,15 +170,15 @@ async def _say(port: EwsReader, order: StartStop, seen: PortStatus, talk: Talk) 
     return True
 
 
-async def _reset(port: EwsReader, talk: Talk) -> None:
+async def _reset(port: EwsReader, turn: Turn) -> None:
     """Restart the box; both ports forget their limits.
 
     Raises NotConfirmedError when nobody answers: it may have restarted all the same.
     """
     box = port.box
-    await port.ready(talk)
+    await port.ready(turn)
     try:
-        await box.ask(talk, CommandId.RESET, reset, decode_reset)
+        await box.ask(turn, CommandId.RESET, reset, decode_reset)
     except ReplyTimeoutError as error:
         raise NotConfirmedError(str(error)) from error
     box.was_reset()

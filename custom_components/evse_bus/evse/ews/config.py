@@ -29,11 +29,3 @@ class EwsPortConfig(ChargerConfig):
     def port(self) -> int:
         """Return the number of the port."""
         return self.address
-
-
-def ews_config(config: ChargerConfig) -> EwsPortConfig:
-    """Return the set-up as this protocol's own; TypeError for another one's."""
-    if not isinstance(config, EwsPortConfig):
-        message = f"{config.name} is not set up as a port of an EWS-Box"
-        raise TypeError(message)
-    return config

@@ -11,7 +11,7 @@ import itertools
 from typing import TYPE_CHECKING
 
 from ..errors import RefusedOrderError
-from ..exchange import Talk
+from ..exchange import Turn
 from .answers import confirmed
 from .commands import MAXIMUM_ROM_BYTES, activate_firmware, erase_rom, write_rom
 from .frames import CommandId, Request
@@ -52,8 +52,8 @@ async def _say(port: EwsPort, command: CommandId, request: Request) -> None:
 
 
 async def _tell(
-    port: EwsPort, command: CommandId, request: Request, talk: Talk
+    port: EwsPort, command: CommandId, request: Request, turn: Turn
 ) -> None:
     await port.box.ask(
-        talk, command, lambda: request, confirmed(command), patience=ERASE_PATIENCE
+        turn, command, lambda: request, confirmed(command), patience=ERASE_PATIENCE
     )

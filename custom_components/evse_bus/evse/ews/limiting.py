@@ -9,11 +9,11 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
+from ..conversation import rest
 from ..errors import NotAvailableError, NotConfirmedError, ReplyTimeoutError
-from ..exchange import Talk
+from ..exchange import Turn
 from ..model import MINIMUM_CURRENT, CurrentLimit, Fault, Orders
 from ..safety import Setpoint, clamp
-from ..turns import rest
 from .answers import EwsRefusedError
 from .commands import set_limit
 from .frames import CommandId, Request
@@ -78,7 +78,7 @@ class Limiter:
         offered = seen.offered_current if seen is not None else None
         return told == 0 and bool(offered) and offered is not None and offered <= wanted
 
-    def must_assert(self) -> bool:
+    def must_reassert(self) -> bool:
         """Return whether the limit is to be said."""
         setpoint = self.wanted(self._port.effective_orders)
         told = self.told
@@ -92,7 +92,7 @@ class Limiter:
     def check(self) -> None:
         """Take the fault away when all is well again."""
         port = self._port
-        if self.must_assert() or port.permission.must_pause(port.setpoint):
+        if self.must_reassert() or port.permission.must_pause(port.setpoint):
             return
         port.notice(Fault.LIMIT_NOT_TAKEN, present=False)
 
@@ -103,43 +103,43 @@ class Limiter:
 
     # -- Saying it -----------------------------------------------------------------
 
-    async def enforce(self, talk: Talk, orders: Callable[[], Orders]) -> None:
+    async def enforce(self, turn: Turn, orders: Callable[[], Orders]) -> None:
         """Say the limit until it is read back, at it or below it.
 
         Raises NotConfirmedError when the box does not follow, EwsRefusedError when it
         says so, and what `EwsReader.look` raises.
         """
         port = self._port
-        patience = talk.now + READY_PATIENCE
+        patience = turn.now + READY_PATIENCE
         sends = 0
         while sends < SENDS:
-            await port.ready(talk)
+            await port.ready(turn)
             # The cable counts as well, and is seen right now only.
-            seen = await port.look(talk)
+            seen = await port.look(turn)
             if self.wanted(orders()) is None:
                 return
             sends += 1
             try:
-                said, answered = await self._say(talk, orders)
+                said, answered = await self._say(turn, orders)
             except EwsRefusedError:
-                if seen.status == STARTING and talk.now < patience:
+                if seen.status == STARTING and turn.now < patience:
                     sends -= 1
                     await rest(READY_PAUSE)
                     continue
                 await rest(0.0)
-                await self._after_refusal(talk)
+                await self._after_refusal(turn)
                 raise
             await rest(0.0)
             for _ in range(LOOKS):
-                await port.ready(talk)
-                if await self._is_read_back(talk, said, answered=answered):
+                await port.ready(turn)
+                if await self._is_read_back(turn, said, answered=answered):
                     return
                 await rest(LOOK_AGAIN)
         port.notice(Fault.LIMIT_NOT_TAKEN, present=True)
         message = f"{port.config.name} does not follow its limit"
         raise NotConfirmedError(message)
 
-    async def _say(self, talk: Talk, orders: Callable[[], Orders]) -> tuple[int, bool]:
+    async def _say(self, turn: Turn, orders: Callable[[], Orders]) -> tuple[int, bool]:
         """Say it; return what was said, A, and whether that was answered.
 
         What was not may have been heard all the same.
@@ -157,21 +157,21 @@ class Limiter:
 
         self._confirmed = self._other = None
         try:
-            await port.box.tell(talk, CommandId.SET_LIMIT, request)
+            await port.box.tell(turn, CommandId.SET_LIMIT, request)
         except ReplyTimeoutError:
             return said[-1], False
         return said[-1], True
 
-    async def _is_read_back(self, talk: Talk, said: int, *, answered: bool) -> bool:
+    async def _is_read_back(self, turn: Turn, said: int, *, answered: bool) -> bool:
         """Return whether the box offers that, or less because it cannot offer more.
 
         A lower one after a lost answer is the one before: to be said again.
         """
         port = self._port
         try:
-            await port.box.look(talk)
+            await port.box.look(turn)
             port.take()
-            await port.box.look_closer(talk)
+            await port.box.look_closer(turn)
         except ReplyTimeoutError:
             return False
         port.take()
@@ -185,10 +185,10 @@ class Limiter:
         port.notice(Fault.LIMIT_NOT_TAKEN, present=False)
         return True
 
-    async def _after_refusal(self, talk: Talk) -> None:
+    async def _after_refusal(self, turn: Turn) -> None:
         """Leave a box that refused at no more than was ordered: at 6 A, if need be."""
         port = self._port
-        await port.ready(talk)
+        await port.ready(turn)
         wanted = self.wanted(port.effective_orders)
         told = self.told
         if wanted is None or told is None:
@@ -199,4 +199,4 @@ class Limiter:
             return
         port.notice(Fault.LIMIT_NOT_TAKEN, present=True)
         with suppress(EwsRefusedError):
-            await self._say(talk, lambda: _LOWEST)
+            await self._say(turn, lambda: _LOWEST)

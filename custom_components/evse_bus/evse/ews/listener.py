@@ -18,16 +18,15 @@ from typing import Final
 
 from ..bus import Bus
 from ..errors import EvseError, LineError, PortBusyError, PortMissingError
-from ..exchange import Talk, Wire
+from ..exchange import Turn, Wire
 from ..framing import Frame
 from ..line import line_error
-from ..losses import LOST_WINDOW, MOST_LOST
-from ..quota import Quota
 from ..statistics import ChargerStatistics
+from ..throttle import LOSSES, LOSSES_WINDOW, RateLimiter
 from .accepted import AcceptedLine, Address, Connection
 from .charger import EwsPort
 from .frames import EwsFrame, EwsFramer, MessageId
-from .session import EwsBox
+from .session import EwsBox, Ports
 from .timing import TCP_TIMING
 
 _LOGGER = logging.getLogger(__name__)
@@ -114,7 +113,7 @@ class Listener:
         self._asking: set[str] = set()
         self._asked_at: dict[str, float] = {}
         self._warned: set[str] = set()
-        self._warnings = Quota(MOST_LOST, LOST_WINDOW)
+        self._warnings = RateLimiter(LOSSES, LOSSES_WINDOW)
 
     # -- Life ------------------------------------------------------------------------
 
@@ -180,7 +179,7 @@ class Listener:
             return known
         framer = EwsFramer()
         line = AcceptedLine(name or f"EWS-Box {serial}", lambda: framer.noise)
-        bus = self._buses[serial] = Bus(line, framer, TCP_TIMING, name)
+        bus = self._buses[serial] = Bus(line, framer, TCP_TIMING, name, group=Ports())
         if (stranger := self._strangers.pop(serial, None)) is not None:
             self._keep_for_good(stranger)
             self._bound[serial] = stranger
@@ -332,7 +331,7 @@ class Listener:
         self._warned.discard(serial)
         self._bound[serial] = connection
         bus.line.attach(connection)
-        bus.look_again()
+        bus.reschedule()
 
 
 async def _identify(connection: Connection) -> Stranger:
@@ -350,11 +349,11 @@ async def _identify(connection: Connection) -> Stranger:
             early.append(frame.raw)
         return told
 
-    wire.on_unasked = unasked
+    wire.on_unsolicited = unasked
     line.attach(connection)
     await line.open()
     box = EwsBox()
-    await box.identify(Talk(wire, ChargerStatistics()))
+    await box.identify(Turn(wire, ChargerStatistics()))
     status = box.status
     if status is None or not connection.is_open:
         raise LineError("the connection has ended")

@@ -9,16 +9,16 @@ from collections.abc import Callable
 from math import inf
 from typing import TYPE_CHECKING, Final
 
+from ..conversation import rest
 from ..errors import (
     NotAvailableError,
     NotConfirmedError,
     ReplyTimeoutError,
     SupersededError,
 )
-from ..exchange import Talk
+from ..exchange import Turn
 from ..model import Fault, OrderChange
 from ..safety import Setpoint
-from ..turns import rest
 from .answers import EwsRefusedError, Refusal
 from .commands import start_stop
 from .frames import CommandId, Request
@@ -146,7 +146,7 @@ class Permission:
 
     # -- Pausing -------------------------------------------------------------------
 
-    async def pause(self, talk: Talk, *, for_current: bool) -> None:
+    async def pause(self, turn: Turn, *, for_current: bool) -> None:
         """Stop a charge under way, and keep the cable locked.
 
         ``for_current``: only our limit of 0 A wants so. Raises NotConfirmedError when
@@ -157,17 +157,17 @@ class Permission:
         if not for_current:
             self.waits_for_current = False
         while True:
-            await port.ready(talk)
-            seen = await port.look_now(talk)
+            await port.ready(turn)
+            seen = await port.look_now(turn)
             if not self._runs(seen):
                 break
-            if talk.now >= self._said_at + SETTLING:
+            if turn.now >= self._said_at + SETTLING:
                 if sends == SENDS:
                     port.notice(Fault.LIMIT_NOT_TAKEN, present=True)
                     message = f"{port.config.name} does not pause"
                     raise NotConfirmedError(message)
                 sends += 1
-                await self._say_pause(talk, seen)
+                await self._say_pause(turn, seen)
             await rest(LOOK_AGAIN)
         if sends and self.paused is None and seen.status in AFTER_OUR_PAUSE:
             # The answer was lost, and it has followed.
@@ -175,7 +175,7 @@ class Permission:
         if for_current and self.paused is not False and self._said_at > -inf:
             self.waits_for_current = seen.status in AFTER_OUR_PAUSE
 
-    async def _say_pause(self, talk: Talk, seen: PortStatus) -> None:
+    async def _say_pause(self, turn: Turn, seen: PortStatus) -> None:
         port = self._port
         changes = port.box.changes
 
@@ -183,7 +183,7 @@ class Permission:
             if port.box.changes != changes:
                 message = f"{port.config.name}: something happens there right now"
                 raise SupersededError(message)
-            self._said_at = talk.now
+            self._said_at = turn.now
             # Until the answer nobody knows.
             self.paused = None
             self._time, self._energy = seen.session_time, seen.session_energy
@@ -191,7 +191,7 @@ class Permission:
             return start_stop(port.port, StartStop.PAUSE, seen)
 
         try:
-            await port.box.tell(talk, CommandId.START_STOP, request)
+            await port.box.tell(turn, CommandId.START_STOP, request)
         except SupersededError:
             return
         except ReplyTimeoutError:
@@ -218,7 +218,7 @@ class Permission:
         return asked and self.waits_for_current
 
     async def start(
-        self, talk: Talk, still: Callable[[], bool], *, for_current: bool
+        self, turn: Turn, still: Callable[[], bool], *, for_current: bool
     ) -> None:
         """Let the car charge that waits, or that we have paused.
 
@@ -229,17 +229,17 @@ class Permission:
         at once, EwsRefusedError, SupersededError, and what `EwsReader.look` raises.
         """
         port = self._port
-        patience = talk.now + READY_PATIENCE
+        patience = turn.now + READY_PATIENCE
         said_at: float | None = None
         sends = 0
         while True:
-            await port.ready(talk)
-            seen = await port.look_now(talk)
-            settled = said_at is None or talk.now >= said_at + SETTLING
+            await port.ready(turn)
+            seen = await port.look_now(turn)
+            settled = said_at is None or turn.now >= said_at + SETTLING
             if self._has_started(seen, settled=settled):
                 break
             if seen.status == STARTING:
-                self._check_patience(talk, patience)
+                self._check_patience(turn, patience)
                 await rest(READY_PAUSE)
                 continue
             if not settled:
@@ -250,9 +250,9 @@ class Permission:
                 raise NotConfirmedError(message)
             if self._nobody_waits(seen, said=sends > 0, for_current=for_current):
                 break
-            said_at, done = await self._say_start(talk, seen, still)
+            said_at, done = await self._say_start(turn, seen, still)
             if done is None:
-                self._check_patience(talk, patience)
+                self._check_patience(turn, patience)
                 said_at = None
                 await rest(READY_PAUSE)
                 continue
@@ -260,8 +260,8 @@ class Permission:
             await rest(LOOK_AGAIN)
         self.waits_for_current = False
 
-    def _check_patience(self, talk: Talk, until: float) -> None:
-        if talk.now >= until:
+    def _check_patience(self, turn: Turn, until: float) -> None:
+        if turn.now >= until:
             message = f"{self._port.config.name} is still starting up"
             raise NotAvailableError(message)
 
@@ -291,7 +291,7 @@ class Permission:
         return settled and released and seen.status == WAITING
 
     async def _say_start(
-        self, talk: Talk, seen: PortStatus, still: Callable[[], bool]
+        self, turn: Turn, seen: PortStatus, still: Callable[[], bool]
     ) -> tuple[float, bool | None]:
         """Say it; return when, and whether it was taken (``None``: not ready yet)."""
         port = self._port
@@ -303,17 +303,17 @@ class Permission:
             return start_stop(port.port, StartStop.START, seen, paused=paused)
 
         try:
-            await port.box.tell(talk, CommandId.START_STOP, request)
+            await port.box.tell(turn, CommandId.START_STOP, request)
         except ReplyTimeoutError:
-            return talk.now, False
+            return turn.now, False
         except EwsRefusedError as error:
             if error.reason is Refusal.NOT_READY:
-                return talk.now, None
+                return turn.now, None
             if error.reason is Refusal.WAITING_FOR_UNPLUG:
                 self.paused = False
                 self.waits_for_current = False
             raise
         self.paused = False
         self._said_at = -inf
-        self._started_at = talk.now
-        return talk.now, True
+        self._started_at = turn.now
+        return turn.now, True

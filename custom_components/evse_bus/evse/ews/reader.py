@@ -10,10 +10,10 @@ from typing import ClassVar, Final, override
 
 from ..charger import Charger
 from ..errors import NotAvailableError, WrongChargerError
-from ..exchange import Talk
-from ..model import Capability, ChargerConfig, Fault, Limits, Orders
+from ..exchange import Turn
+from ..model import Capability, Fault, Limits, Orders
 from .accepted import AcceptedLine
-from .config import ews_config
+from .config import EwsPortConfig
 from .events import (
     ChargeStarted,
     Event,
@@ -44,21 +44,22 @@ NOT_UNDERSTOOD: Final = 3
 """Answers in a row that cannot be, until nothing said before counts any more."""
 
 
-class EwsReader(Charger):
+class EwsReader(Charger[EwsPortConfig]):
     """One port, as far as it is asked and not told."""
 
     timing: ClassVar = TIMING
 
-    def __init__(self, config: ChargerConfig, orders: Orders) -> None:
+    def __init__(self, config: EwsPortConfig, orders: Orders) -> None:
         """Take the set-up; the box is not known before it answers."""
         super().__init__(config, orders)
-        self.port: Final = ews_config(config).port
+        self.port: Final = config.port
         self.seen: PortStatus | None = None
         """What ``rc`` told last of this port."""
-        self._own_box = EwsBox()
+        self.box = EwsBox()
+        """The box, shared with the other port of this bus."""
         self.permission = Permission(self)
         self.limiter = Limiter(self)
-        self._assert_after = -inf
+        self._reassert_after = -inf
         self._charges = False
         self._running: PortStatus | None = None
         """How the port was when a charge was last seen under way."""
@@ -66,16 +67,6 @@ class EwsReader(Charger):
         self._restarts = 0
 
     # -- What it is and has --------------------------------------------------------
-
-    @property
-    def box(self) -> EwsBox:
-        """Return the box, shared with the other port of this bus."""
-        bus = self.bus
-        if bus is None:
-            return self._own_box
-        if not isinstance(bus.shared, EwsBox):
-            bus.shared = EwsBox()
-        return bus.shared
 
     @property
     @override
@@ -108,11 +99,11 @@ class EwsReader(Charger):
 
     @property
     @override
-    def told(self) -> tuple[object, ...]:
+    def fingerprint(self) -> tuple[object, ...]:
         status = self.box.status
         # Its clock runs: that is no news.
         without = None if status is None else replace(status, clock=None)
-        return (*super().told, self.seen, self.more, without)
+        return (*super().fingerprint, self.seen, self.more, without)
 
     @property
     def more(self) -> tuple[object, ...]:
@@ -140,9 +131,7 @@ class EwsReader(Charger):
             self.box.line_opened(self.bus.line.statistics.opened)
         self.seen = None
         self.limiter.forget()
-        # A conversation that was cut short with the line does not come to its end.
-        self._conversations.clear()
-        self._assert_after = -inf
+        self._reassert_after = -inf
 
     # -- When ------------------------------------------------------------------------
 
@@ -152,9 +141,9 @@ class EwsReader(Charger):
         self._meet_deadline(now)
 
     @override
-    def heard(self, now: float) -> None:
+    def on_reply(self, now: float) -> None:
         is_back = not self.available
-        super().heard(now)
+        super().on_reply(now)
         if is_back and self.bus is not None:
             # It is there for its other port, too: that one waits for no next try.
             for other in self.bus.chargers.values():
@@ -162,8 +151,8 @@ class EwsReader(Charger):
                     other.hurry()
 
     @override
-    def missed(self, now: float) -> None:
-        super().missed(now)
+    def on_missed(self, now: float) -> None:
+        super().on_missed(now)
         self._meet_deadline(now)
 
     def _meet_deadline(self, now: float) -> None:
@@ -188,7 +177,7 @@ class EwsReader(Charger):
         self.slot.ready = min(self.slot.ready, at)
         self.slot.due = min(self.slot.due, at)
         if self.bus is not None:
-            self.bus.look_again()
+            self.bus.reschedule()
 
     def ask_now(self) -> None:
         """Poll as soon as the bus is free, however fresh what is known may be."""
@@ -197,14 +186,14 @@ class EwsReader(Charger):
 
     # -- Who it is, and what it says -------------------------------------------------
 
-    async def ready(self, talk: Talk) -> None:
+    async def ready(self, turn: Turn) -> None:
         """Make sure that we know whom we talk to.
 
         Raises WrongChargerError for another box, and what `EwsBox.read` raises.
         """
         box = self.box
         while not box.known or box.installation is None:
-            await box.meet(talk)
+            await box.meet(turn)
         self._check_identity()
 
     def _check_identity(self) -> None:
@@ -228,19 +217,19 @@ class EwsReader(Charger):
             self.notice(Fault.IMPLAUSIBLE, present=True)
             self.set_unavailable()
 
-    async def look(self, talk: Talk) -> PortStatus:
+    async def look(self, turn: Turn) -> PortStatus:
         """Read how the port is right now; the box must be `ready`.
 
         Raises NotAvailableError for a port that there is not.
         """
-        await self.box.look(talk)
+        await self.box.look(turn)
         return self.take()
 
-    async def look_now(self, talk: Talk) -> PortStatus:
+    async def look_now(self, turn: Turn) -> PortStatus:
         """Look; once more if a record came that says it is not so any more."""
-        seen = await self.look(talk)
+        seen = await self.look(turn)
         if self.box.ports_at == -inf:
-            seen = await self.look(talk)
+            seen = await self.look(turn)
         return seen
 
     def take(self) -> PortStatus:
@@ -273,7 +262,7 @@ class EwsReader(Charger):
             known = self.permission.paused
             paused = None if known is None else self.permission.is_paused(seen)
             self.reading = charger_reading(self.port, told, paused=paused)
-        if self.told != self.last_told:
+        if self.fingerprint != self.last_fingerprint:
             self.updated()
         return seen
 

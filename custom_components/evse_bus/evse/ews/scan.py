@@ -4,7 +4,6 @@ There is one box on a line: it is found by its serial number, whichever ports it
 ``id`` is asked under both readings of the checksum (manual, 3.2.2).
 """
 
-from functools import partial
 from math import inf
 from typing import TYPE_CHECKING, Final
 
@@ -15,11 +14,8 @@ from ..errors import (
     LineBusyError,
     ReplyTimeoutError,
 )
-from ..exchange import Talk
-from ..found import FoundCharger, ScanReport
-from ..jobs import Later
 from ..model import ChargerConfig, Orders
-from ..turns import in_turns
+from ..scan import FoundCharger, ScanResult
 from .readings import charger_info, limits_of
 from .session import EwsBox
 
@@ -33,7 +29,7 @@ TRIES: Final = 4
 
 async def scan(
     bus: Bus, config: ChargerConfig, orders: Orders, progress: Progress
-) -> ScanReport:
+) -> ScanResult:
     """Look for a box; ``config`` and ``orders`` are not needed.
 
     Raises LineLostError when the port is lost meanwhile.
@@ -44,7 +40,7 @@ async def scan(
     progress(0.0)
     for attempt in range(TRIES):
         try:
-            await bus.run(partial(_meet, box))
+            await bus.run(box.meet)
         except GarbledReplyError:
             unreadable += 1
         except ReplyTimeoutError, LineBusyError:
@@ -54,14 +50,10 @@ async def scan(
             unreadable += 1
         if box.known and box.installation is not None:
             progress(1.0)
-            return ScanReport(found=_found(box))
+            return ScanResult(found=_found(box))
         progress((attempt + 1) / TRIES)
     # A box is silent under the reading of the checksum that is not its own.
-    return ScanReport(unreadable=unreadable >= TRIES // 2)
-
-
-async def _meet(box: EwsBox, talk: Talk) -> Later[None] | None:
-    return await in_turns(box.meet)(talk)
+    return ScanResult(unreadable=unreadable >= TRIES // 2)
 
 
 def _found(box: EwsBox) -> tuple[FoundCharger, ...]:

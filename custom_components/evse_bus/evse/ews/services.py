@@ -8,10 +8,9 @@ from collections.abc import Awaitable, Callable, Mapping
 from datetime import tzinfo
 from typing import TYPE_CHECKING, Final
 
+from ..conversation import rest
 from ..errors import NotConfirmedError, RefusedOrderError, ReplyTimeoutError
-from ..exchange import Talk
-from ..jobs import Later
-from ..turns import in_turns, rest
+from ..exchange import Turn
 from .answers import decode_card_reader
 from .box import Dhcp, decode_dhcp
 from .cards import (
@@ -59,8 +58,8 @@ class Services:
         """
         request = accept_card(card)
         await self.in_a_turn(
-            lambda talk: self._port.box.tell(
-                talk, CommandId.ACCEPT_CARD, lambda: request
+            lambda turn: self._port.box.tell(
+                turn, CommandId.ACCEPT_CARD, lambda: request
             )
         )
 
@@ -75,10 +74,10 @@ class Services:
         """
         wanted: list[CardList] = []
 
-        async def write(talk: Talk) -> None:
-            cards = (await self._read_cards(talk)).with_entries(changes)
+        async def write(turn: Turn) -> None:
+            cards = (await self._read_cards(turn)).with_entries(changes)
             wanted.append(cards)
-            await self._tell(talk, CommandId.WRITE_CARDS, write_cards(cards))
+            await self._tell(turn, CommandId.WRITE_CARDS, write_cards(cards))
 
         return await self._write_and_read(
             write,
@@ -87,8 +86,8 @@ class Services:
             lambda: "its card list",
         )
 
-    async def _read_cards(self, talk: Talk) -> CardList:
-        return await self._port.box.read(talk, CommandId.READ_CARDS, decode_cards)
+    async def _read_cards(self, turn: Turn) -> CardList:
+        return await self._port.box.read(turn, CommandId.READ_CARDS, decode_cards)
 
     async def card_reader(
         self, target: ReaderTarget, patience: int, data: bytes
@@ -102,8 +101,8 @@ class Services:
             raise RefusedOrderError(message)
         request = card_reader(target, patience, data)
         return await self.in_a_turn(
-            lambda talk: self._port.box.ask(
-                talk,
+            lambda turn: self._port.box.ask(
+                turn,
                 CommandId.CARD_READER,
                 lambda: request,
                 decode_card_reader,
@@ -122,9 +121,9 @@ class Services:
         port = self._port
         request = set_meter(port.port, total)
 
-        async def write(talk: Talk) -> None:
-            await port.look(talk)
-            await port.box.tell(talk, CommandId.SET_METER, lambda: request)
+        async def write(turn: Turn) -> None:
+            await port.look(turn)
+            await port.box.tell(turn, CommandId.SET_METER, lambda: request)
 
         await self.in_a_turn(write)
         port.hurry()
@@ -133,17 +132,17 @@ class Services:
         """Set the LEDs of both ports; only a box with manual keys and LEDs (``se``)."""
         request = set_leds(first, second)
         await self.in_a_turn(
-            lambda talk: self._port.box.tell(talk, CommandId.SET_LEDS, lambda: request)
+            lambda turn: self._port.box.tell(turn, CommandId.SET_LEDS, lambda: request)
         )
 
     async def set_clock(self, zone: tzinfo) -> None:
         """Set the clock to the time in this zone, however wrong it is (``sc``)."""
-        await self.in_a_turn(lambda talk: self._port.box.set_clock(talk, zone))
+        await self.in_a_turn(lambda turn: self._port.box.set_clock(turn, zone))
 
     async def read_dhcp(self) -> Dhcp:
         """Return what DHCP gave the box (``rg``)."""
         return await self.in_a_turn(
-            lambda talk: self._port.box.read(talk, CommandId.READ_DHCP, decode_dhcp)
+            lambda turn: self._port.box.read(turn, CommandId.READ_DHCP, decode_dhcp)
         )
 
     # -- Parameters ------------------------------------------------------------------
@@ -151,7 +150,7 @@ class Services:
     async def read_parameters[T](self, block: Block[T]) -> T:
         """Return a block of parameters (``rp ru ri rz``); passwords are in it."""
         return await self.in_a_turn(
-            lambda talk: self._port.box.read(talk, block.read, block.decode)
+            lambda turn: self._port.box.read(turn, block.read, block.decode)
         )
 
     async def change_parameters[T](
@@ -171,13 +170,13 @@ class Services:
         wanted: dict[str, object] = {}
         answered = False
 
-        async def write(talk: Talk) -> None:
+        async def write(turn: Turn) -> None:
             nonlocal answered
-            raw = await box.read(talk, block.read, bytes)
+            raw = await box.read(turn, block.read, bytes)
             wanted.update(
                 changes if isinstance(changes, Mapping) else changes(block.decode(raw))
             )
-            answered = await self._tell(talk, block.write, block.change(raw, wanted))
+            answered = await self._tell(turn, block.write, block.change(raw, wanted))
 
         def stands(told: T) -> bool:
             secrets = block.secrets_told(told)
@@ -191,7 +190,7 @@ class Services:
         try:
             return await self._write_and_read(
                 write,
-                lambda talk: box.read(talk, block.read, block.decode),
+                lambda turn: box.read(turn, block.read, block.decode),
                 stands,
                 lambda: ", ".join(sorted(wanted)),
             )
@@ -202,27 +201,24 @@ class Services:
     # -- Turns -----------------------------------------------------------------------
 
     async def in_a_turn[T](
-        self, work: Callable[[Talk], Awaitable[T]], *, patience: float = 0.0
+        self, work: Callable[[Turn], Awaitable[T]], *, patience: float = 0.0
     ) -> T:
         """Do something in one turn of the bus, the box being known.
 
         ``patience``: longer than a reply usually takes, s.
         """
         port = self._port
-        done: list[T] = []
 
-        async def talks(talk: Talk) -> None:
-            await port.ready(talk)
+        async def conversation(turn: Turn) -> T:
+            if patience:
+                await rest(worst_case=self._worst_case(patience))
+            await port.ready(turn)
             try:
-                done.append(await work(talk))
+                return await work(turn)
             except ReplyTimeoutError as error:
                 raise NotConfirmedError(str(error)) from error
 
-        async def first(_talk: Talk) -> Later[None] | None:
-            return Later(0.0, in_turns(talks), self._worst_case(patience))
-
-        await port.run(first)
-        return done[0]
+        return await port.run(conversation)
 
     def _worst_case(self, patience: float) -> float | None:
         bus = self._port.bus
@@ -230,21 +226,21 @@ class Services:
             return None
         return bus.worst_case(self._port) + patience
 
-    async def _tell(self, talk: Talk, command: CommandId, request: Request) -> bool:
+    async def _tell(self, turn: Turn, command: CommandId, request: Request) -> bool:
         """Write; return whether it was answered.
 
         A lost answer decides nothing, what is read back does.
         """
         try:
-            await self._port.box.tell(talk, command, lambda: request)
+            await self._port.box.tell(turn, command, lambda: request)
         except ReplyTimeoutError:
             return False
         return True
 
     async def _write_and_read[T](
         self,
-        write: Callable[[Talk], Awaitable[None]],
-        read: Callable[[Talk], Awaitable[T]],
+        write: Callable[[Turn], Awaitable[None]],
+        read: Callable[[Turn], Awaitable[T]],
         stands: Callable[[T], bool],
         what: Callable[[], str],
     ) -> T:
@@ -253,26 +249,23 @@ class Services:
         Raises NotConfirmedError when it does not.
         """
         port = self._port
-        told: list[T] = []
 
-        async def talks(talk: Talk) -> None:
-            await port.ready(talk)
-            await write(talk)
+        async def conversation(turn: Turn) -> T:
+            await port.ready(turn)
+            await write(turn)
             for _ in range(LOOKS):
                 await rest(LOOK_AGAIN)
-                await port.ready(talk)
+                await port.ready(turn)
                 try:
-                    found = await read(talk)
+                    found = await read(turn)
                 except ReplyTimeoutError:
                     continue
                 if stands(found):
-                    told.append(found)
-                    return
+                    return found
             message = f"{port.config.name} did not take {what()}"
             raise NotConfirmedError(message)
 
-        await port.run(in_turns(talks))
-        return told[0]
+        return await port.run(conversation)
 
 
 def _as_read(value: object) -> object:

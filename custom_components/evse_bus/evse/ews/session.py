@@ -13,12 +13,14 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, tzinfo
 from functools import partial
 from math import inf
-from typing import Final
+from typing import Final, Protocol, cast, override
 
+from ..charger import Charger
+from ..conversation import rest
 from ..errors import ExchangeError, LineError, ReplyTimeoutError
-from ..exchange import Talk
-from ..quota import Quota
-from ..turns import rest
+from ..exchange import Turn
+from ..master import ChargerGroup
+from ..throttle import RateLimiter
 from .answers import answer, confirmed, decode_firmware_id
 from .box import BoxFlags, BoxStatus, decode_box
 from .commands import read, set_clock
@@ -70,7 +72,7 @@ class EwsBox:
     def __init__(self) -> None:
         """Nothing is known before it answers."""
         self.events = Events()
-        self._keys = Quota(MOST_KEYS, 1.0)
+        self._keys = RateLimiter(MOST_KEYS, 1.0)
         self.clock: Callable[[], datetime] = partial(datetime.now, UTC)
         """The right time."""
         self.heard_at = -inf
@@ -135,26 +137,26 @@ class EwsBox:
     # -- Asking --------------------------------------------------------------------
 
     async def read[T](
-        self, talk: Talk, command: CommandId, decode: Callable[[bytes], T]
+        self, turn: Turn, command: CommandId, decode: Callable[[bytes], T]
     ) -> T:
         """Return what the answer to a reading command says.
 
-        Raises ImplausibleReplyError, and what `Talk.exchange` raises.
+        Raises ImplausibleReplyError, and what `Turn.exchange` raises.
         """
-        return await self.ask(talk, command, lambda: read(command), decode)
+        return await self.ask(turn, command, lambda: read(command), decode)
 
     async def tell(
-        self, talk: Talk, command: CommandId, make: Callable[[], Request]
+        self, turn: Turn, command: CommandId, make: Callable[[], Request]
     ) -> None:
         """Say something that is answered by one byte; return when it was OK.
 
         Raises EwsRefusedError, and what `read` raises.
         """
-        await self.ask(talk, command, make, confirmed(command))
+        await self.ask(turn, command, make, confirmed(command))
 
     async def ask[T](
         self,
-        talk: Talk,
+        turn: Turn,
         command: CommandId,
         make: Callable[[], Request],
         decode: Callable[[bytes], T],
@@ -164,7 +166,7 @@ class EwsBox:
         """Have one exchange; ``make`` is asked right before its command goes."""
         bcc = self.bcc or Bcc.ALL
         try:
-            result = await talk.exchange(
+            result = await turn.exchange(
                 lambda: make().encode(bcc),
                 answer(command, decode, self.bcc),
                 patience=patience,
@@ -173,9 +175,9 @@ class EwsBox:
             self.doubt()
             raise
         except ExchangeError:
-            self._note(talk)
+            self._note(turn)
             raise
-        self._note(talk)
+        self._note(turn)
         return result
 
     def doubt(self) -> None:
@@ -188,13 +190,13 @@ class EwsBox:
         self._flagged = False
         self.doubt()
 
-    def _note(self, talk: Talk) -> None:
-        if talk.sent_at is not None:
-            self.heard_at = talk.sent_at
+    def _note(self, turn: Turn) -> None:
+        if turn.sent_at is not None:
+            self.heard_at = turn.sent_at
 
     # -- Who it is -----------------------------------------------------------------
 
-    async def identify(self, talk: Talk) -> BoxStatus:
+    async def identify(self, turn: Turn) -> BoxStatus:
         """Ask who it is, under one reading of the checksum and the other, until told.
 
         Nothing but ``id`` and ``rs``. Raises LineError, and ImplausibleReplyError or
@@ -202,12 +204,12 @@ class EwsBox:
         """
         while True:
             try:
-                await self._find_reading(talk)
-                return await self.read_status(talk)
+                await self._find_reading(turn)
+                return await self.read_status(turn)
             except ReplyTimeoutError:
                 continue
 
-    async def meet(self, talk: Talk) -> None:
+    async def meet(self, turn: Turn) -> None:
         """Find out who answers, and what is installed, one exchange a turn.
 
         Two ports may do so at the same time: what one has learnt the other skips.
@@ -215,15 +217,15 @@ class EwsBox:
         """
         while not self._known:
             if not self._answers:
-                await self._find_reading(talk)
+                await self._find_reading(turn)
             else:
-                await self.read_status(talk)
+                await self.read_status(turn)
                 self._known = True
             await rest(0.0)
         if self.installation is None:
-            await self.read_parameters(talk)
+            await self.read_parameters(turn)
 
-    async def _find_reading(self, talk: Talk) -> None:
+    async def _find_reading(self, turn: Turn) -> None:
         """Let it answer ``id``, under one reading of the checksum or the other."""
         readings = tuple(Bcc)
         usual = readings.index(self.bcc or readings[self._tries % 2])
@@ -236,16 +238,16 @@ class EwsBox:
             return None if firmware is None else (firmware, frame.bcc)
 
         request = read(CommandId.READ_FIRMWARE_ID).encode(bcc)
-        self.firmware, self.bcc = await talk.exchange(request, accept)
+        self.firmware, self.bcc = await turn.exchange(request, accept)
         self._tries = 0
         self._answers = True
-        self._note(talk)
+        self._note(turn)
 
-    async def read_status(self, talk: Talk) -> BoxStatus:
+    async def read_status(self, turn: Turn) -> BoxStatus:
         """Read ``rs``: who it is, its clock, the card at the reader."""
-        status = await self.read(talk, CommandId.READ_BOX, decode_box)
+        status = await self.read(turn, CommandId.READ_BOX, decode_box)
         before, self.status = self.status, status
-        self.status_due = talk.now + BOX_INTERVAL
+        self.status_due = turn.now + BOX_INTERVAL
         if before is not None and before.serial != status.serial:
             self.installation = None
             self.ports = ()
@@ -275,21 +277,21 @@ class EwsBox:
                 )
             )
 
-    async def read_parameters(self, talk: Talk) -> None:
+    async def read_parameters(self, turn: Turn) -> None:
         """Read what is installed; a box that does not tell is taken as it comes."""
-        self.parameters_due = talk.now + PARAMETERS_RETRY
+        self.parameters_due = turn.now + PARAMETERS_RETRY
         system: SystemParameters | None = None
         try:
-            system = await self.read(talk, SYSTEM_BLOCK.read, SYSTEM_BLOCK.decode)
+            system = await self.read(turn, SYSTEM_BLOCK.read, SYSTEM_BLOCK.decode)
             await rest(0.0)
-            extra = await self.read(talk, EXTRA_BLOCK.read, EXTRA_BLOCK.decode)
+            extra = await self.read(turn, EXTRA_BLOCK.read, EXTRA_BLOCK.decode)
         except ExchangeError:
             if system is not None:
                 # What one block tells counts, also when the other is not told.
                 self.installation = self._installation(system, None)
             self.installation = self.installation or Installation()
             return
-        self.parameters_due = talk.now + PARAMETERS_INTERVAL
+        self.parameters_due = turn.now + PARAMETERS_INTERVAL
         self.installation = self._installation(system, extra.maximum_current_2)
 
     def _installation(
@@ -305,27 +307,27 @@ class EwsBox:
 
     # -- What it says --------------------------------------------------------------
 
-    async def refresh(self, talk: Talk, oldest: float) -> None:
+    async def refresh(self, turn: Turn, oldest: float) -> None:
         """Read what is older than ``oldest`` (loop time): up to three exchanges."""
         if self.ports_at < oldest or self.details is None:
-            await self.look(talk)
-            await self.look_closer(talk)
-        if talk.now >= self.status_due:
-            await self.read_status(talk)
+            await self.look(turn)
+            await self.look_closer(turn)
+        if turn.now >= self.status_due:
+            await self.read_status(turn)
 
-    async def look(self, talk: Talk) -> tuple[PortStatus, ...]:
+    async def look(self, turn: Turn) -> tuple[PortStatus, ...]:
         """Read ``rc``: how the ports are, right now."""
         known = self.installation or Installation()
         decode = partial(decode_ports, mode_1=known.mode_1, count=known.ports)
         changes = self.changes
-        self.ports = await self.read(talk, CommandId.READ_PORTS, decode)
+        self.ports = await self.read(turn, CommandId.READ_PORTS, decode)
         # A record that came meanwhile says that they are not so any more.
-        self.ports_at = talk.now if changes == self.changes else -inf
+        self.ports_at = turn.now if changes == self.changes else -inf
         return self.ports
 
-    async def look_closer(self, talk: Talk) -> Details:
+    async def look_closer(self, turn: Turn) -> Details:
         """Read ``rd``: limit and power of the ports."""
-        self.details = await self.read(talk, CommandId.READ_DETAILS, decode_details)
+        self.details = await self.read(turn, CommandId.READ_DETAILS, decode_details)
         return self.details
 
     def hear(self, info: Info) -> None:
@@ -356,17 +358,35 @@ class EwsBox:
         """Let its clock be set soon if it is wrong: it is to show another zone."""
         self._clock_after = -inf
 
-    async def set_clock(self, talk: Talk, zone: tzinfo) -> None:
+    async def set_clock(self, turn: Turn, zone: tzinfo) -> None:
         """Set its clock to the time in this zone.
 
         Raises EwsRefusedError, and what `read` raises.
         """
-        self._clock_after = talk.now + CLOCK_PAUSE
-        await self.tell(talk, CommandId.SET_CLOCK, lambda: set_clock(self._local(zone)))
+        self._clock_after = turn.now + CLOCK_PAUSE
+        await self.tell(turn, CommandId.SET_CLOCK, lambda: set_clock(self._local(zone)))
         self.status_due = -inf
 
     def _local(self, zone: tzinfo) -> datetime:
         return self.clock().astimezone(zone).replace(tzinfo=None, microsecond=0)
+
+
+class Port(Protocol):
+    """A port, as the owner of its box knows it."""
+
+    box: EwsBox
+
+
+class Ports(ChargerGroup):
+    """The ports of one bus: they are of one box, which they share."""
+
+    def __init__(self) -> None:
+        """Begin with a box that is not known yet."""
+        self.box = EwsBox()
+
+    @override
+    def added(self, charger: Charger) -> None:
+        cast("Port", charger).box = self.box
 
 
 def _installation(system: SystemParameters, maximum: Pair[int | None]) -> Installation:

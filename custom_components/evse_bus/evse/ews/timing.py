@@ -46,7 +46,7 @@ READY_PAUSE: Final = 5.0
 READY_PATIENCE: Final = 60.0
 """Longest time somebody's command waits for a box that is starting, s (0xF0 lasts up
 to 260 s with a power backup, 2.2.3)."""
-ASSERT_PAUSE: Final = 10.0
+REASSERT_PAUSE: Final = 10.0
 """Pause before what a port did not follow is said again by ourselves, s."""
 
 CLOCK_TOLERANCE: Final = 60.0

@@ -35,7 +35,7 @@ MASTER: Final = Protocol(
     config=SlaveConfig,
     charger=SlaveSmartEvse,
     scan=master_scan,
-    duty=Master,
+    master=Master,
 )
 
 __all__ = [

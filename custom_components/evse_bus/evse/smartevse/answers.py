@@ -9,9 +9,9 @@ from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
+from ..conversation import rest
 from ..errors import ExchangeError, LineBusyError, NotAvailableError
-from ..exchange import Talk
-from ..jobs import Later
+from ..exchange import Turn
 from .balancing import RequestKind, SlaveRequest
 from .registers import LONGEST_REQUEST
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from .slave import SlaveSmartEvse
 
 ANSWER_WITHIN: Final = 0.8
-"""Later than this a request is not answered, s: after 1 s the box has given it up, and
+"""FollowUp than this a request is not answered, s: after 1 s the box has given it up, and
 would close its contactor on a late word all the same. It asks again."""
 ANSWER_BYTES: Final = LONGEST_REQUEST
 """A broadcast may go in its place."""
@@ -40,21 +40,22 @@ class Answer:
         self._rounds = ROUNDS
         self._others: list[Member] = []
 
-    async def give(self, talk: Talk) -> Later[None] | None:
-        """Answer, or let the others make room first."""
-        if talk.now > self._too_late:
-            self._slave.answered(self._request)
-            return None
-        try:
-            if self._others_can_make_room():
-                await self._slave.master.speak(talk)
-                return self._look_next()
-            await talk.send(partial(self._slave.answer_frame, self._request))
-        except LineBusyError:
-            return self._go_on()
-        self._slave.answered(self._request)
-        self._slave.master.changed()
-        return None
+    async def give(self, turn: Turn) -> None:
+        """Answer, once the others have made room: a conversation."""
+        slave = self._slave
+        while turn.now <= self._too_late:
+            try:
+                if not self._others_can_make_room():
+                    await turn.send(partial(slave.answer_frame, self._request))
+                    slave.answered(self._request)
+                    slave.master.changed()
+                    return
+                await slave.master.speak(turn)
+                await self._read_others(turn)
+            except LineBusyError:
+                pass
+            await rest(worst_case=self._send_time())
+        slave.answered(self._request)
 
     def _others_can_make_room(self) -> bool:
         slave = self._slave
@@ -71,19 +72,17 @@ class Answer:
         self._rounds -= 1
         return bool(self._others)
 
-    async def _look(self, talk: Talk) -> Later[None] | None:
-        """Read back one of the others: it may have missed the broadcast."""
-        other = self._others.pop()
-        with suppress(ExchangeError, LineBusyError, NotAvailableError):
-            await other.look(talk)
-        return self._look_next() if self._others else self._go_on()
+    async def _read_others(self, turn: Turn) -> None:
+        """Read back the others: they may have missed the broadcast."""
+        while self._others:
+            await rest(worst_case=self._worst_case(self._others[-1]))
+            other = self._others.pop()
+            with suppress(ExchangeError, LineBusyError, NotAvailableError):
+                await other.look(turn)
 
-    def _look_next(self) -> Later[None]:
-        other = self._others[-1]
-        worst = other.bus.worst_case(other) if other.bus is not None else None
-        return Later(0.0, self._look, worst)
+    def _worst_case(self, other: Member) -> float | None:
+        return other.bus.worst_case(other) if other.bus is not None else None
 
-    def _go_on(self) -> Later[None]:
+    def _send_time(self) -> float | None:
         bus = self._slave.bus
-        worst = bus.wire.send_time(ANSWER_BYTES) if bus is not None else None
-        return Later(0.0, self.give, worst)
+        return bus.wire.send_time(ANSWER_BYTES) if bus is not None else None

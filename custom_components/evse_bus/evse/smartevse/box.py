@@ -8,11 +8,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Final, override
 
+from ..conversation import FollowUp, rest
 from ..errors import GarbledReplyError, NotConfirmedError, SupersededError
-from ..exchange import Request, Talk
-from ..jobs import Later
-from ..model import ChargerConfig, Fault, Orders, Range, Setting
-from ..turns import rest
+from ..exchange import Request, Turn
+from ..model import Fault, Orders, Range, Setting
+from .config import SmartEvseConfig
 from .dialects import MAPS
 from .exchanges import write
 from .reader import SmartEvseReader
@@ -27,10 +27,10 @@ GARBLED: Final = 3
 """Unreadable answers in a row that look like two boxes with one address."""
 
 
-class SmartEvseBox(SmartEvseReader):
+class SmartEvseBox[C: SmartEvseConfig](SmartEvseReader[C]):
     """One SmartEVSE."""
 
-    def __init__(self, config: ChargerConfig, orders: Orders) -> None:
+    def __init__(self, config: C, orders: Orders) -> None:
         """Take the set-up; the box is not known before it answers."""
         super().__init__(config, orders)
         self.must_close = False
@@ -38,22 +38,15 @@ class SmartEvseBox(SmartEvseReader):
         self._garbled = 0
         self._set_up = SetUp(self)
 
-    @override
-    def on_line_open(self) -> None:
-        super().on_line_open()
-        # A conversation that was cut short with the line does not come to its end.
-        self._conversations.clear()
-
     # -- The regular exchange ------------------------------------------------------
 
     @override
-    async def poll(self, talk: Talk) -> Later[None] | None:
+    async def poll(self, turn: Turn) -> FollowUp | None:
         try:
             if self.dialect is None:
-                later = await self.turns(self.reach)(talk)
+                await self.reach(turn)
             else:
-                await self.look(talk)
-                later = None
+                await self.look(turn)
         except GarbledReplyError:
             self._garbled += 1
             if self._garbled >= GARBLED:
@@ -61,29 +54,29 @@ class SmartEvseBox(SmartEvseReader):
             raise
         self._garbled = 0
         self.notice(Fault.DUPLICATE_ADDRESS, present=self.shares_address)
-        return later or self.what_now(talk.now)
+        return self.next_action(turn.now)
 
-    def what_now(self, now: float) -> Later[None] | None:
+    def next_action(self, now: float) -> FollowUp | None:
         """Return what must be asked or said because of a status."""
-        if self.busy or not self.must_tend(now):
+        if self.busy or not self.must_maintain(now):
             return None
-        return Later(0.0, self.turns(self._tend))
+        return FollowUp(self._maintain)
 
-    async def _tend(self, talk: Talk) -> None:
+    async def _maintain(self, turn: Turn) -> None:
         with self.conversing():
-            await self.tend(talk)
+            await self.maintain(turn)
 
-    def must_tend(self, now: float) -> bool:
+    def must_maintain(self, now: float) -> bool:
         """Return whether something is to be asked or said beside the status."""
         return now >= self.configuration_due or self.must_close
 
-    async def tend(self, talk: Talk) -> None:
+    async def maintain(self, turn: Turn) -> None:
         """Ask and say what is due; what is not answered is for another time."""
         if self.must_close:
-            await self.close_again(talk)
+            await self.close_again(turn)
             await rest(0.0)
-        if talk.now >= self.configuration_due:
-            await self.read_configuration(talk)
+        if turn.now >= self.configuration_due:
+            await self.read_configuration(turn)
 
     # -- What it keeps in its memory -------------------------------------------------
 
@@ -104,13 +97,13 @@ class SmartEvseBox(SmartEvseReader):
     @override
     async def configure(self, setting: Setting, value: int) -> None:
         conversation = self._set_up.conversation(setting, value)
-        await self.run(self.turns(conversation))
+        await self.run(conversation)
 
     # -- Access ----------------------------------------------------------------------
 
     async def set_access(
         self,
-        talk: Talk,
+        turn: Turn,
         allowed: bool,  # noqa: FBT001
         still: Callable[[], bool] = lambda: True,
     ) -> None:
@@ -121,7 +114,7 @@ class SmartEvseBox(SmartEvseReader):
         Raises SupersededError where it says no, NotConfirmedError when the box does
         not follow.
         """
-        await self.reach(talk)
+        await self.reach(turn)
         dialect = self.known_dialect
 
         def request() -> bytes:
@@ -131,13 +124,13 @@ class SmartEvseBox(SmartEvseReader):
             return write_access(self.config.address, dialect, allowed)
 
         for _ in range(WRITES):
-            await self.write(talk, request, MAPS[dialect].access_register)
+            await self.write(turn, request, MAPS[dialect].access_register)
             if allowed:
                 # The user's word, or a limit that gives back: open it may be.
                 self.must_close = False
             for pause in (0.0, LOOK_AGAIN):
                 await rest(pause)
-                await self.see(talk)
+                await self.see(turn)
                 if self._has_access(allowed):
                     return
             await rest(0.0)
@@ -145,12 +138,12 @@ class SmartEvseBox(SmartEvseReader):
         message = f"{self.config.name} does not turn its access {what}"
         raise NotConfirmedError(message)
 
-    async def close_again(self, talk: Talk) -> None:
+    async def close_again(self, turn: Turn) -> None:
         """Turn access off where a setting has opened it, until it is certain."""
-        await self.see(talk)
+        await self.see(turn)
         if self.status is None or self.status.access:
             await rest(0.0)
-            await self.set_access(talk, allowed=False)
+            await self.set_access(turn, allowed=False)
         self.must_close = False
 
     def _has_access(self, allowed: bool) -> bool:  # noqa: FBT001
@@ -160,8 +153,8 @@ class SmartEvseBox(SmartEvseReader):
             return self.status.access
         return is_stopped(self.known_dialect, self.status)
 
-    async def write(self, talk: Talk, request: Request, register: int) -> bool | None:
+    async def write(self, turn: Turn, request: Request, register: int) -> bool | None:
         """Write a register (see `exchanges.write`)."""
-        return await write(talk, self.config.address, request, register)
+        return await write(turn, self.config.address, request, register)
 
     # -- Conversations -----------------------------------------------------------------

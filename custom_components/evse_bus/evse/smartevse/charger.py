@@ -11,15 +11,15 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Final, override
 
+from ..conversation import rest
 from ..errors import (
     NotConfirmedError,
     RefusedOrderError,
     SupersededError,
 )
-from ..exchange import Talk
+from ..exchange import Turn
 from ..model import (
     MINIMUM_CURRENT,
-    ChargerConfig,
     Command,
     CurrentLimit,
     Fault,
@@ -28,7 +28,6 @@ from ..model import (
     Persistence,
 )
 from ..safety import Setpoint, clamp
-from ..turns import rest
 from .box import WRITES
 from .config import PolledConfig
 from .dialects import MAPS, Dialect
@@ -45,7 +44,7 @@ _LOWEST: Final = Orders(limit=CurrentLimit(current=MINIMUM_CURRENT))
 class PolledSmartEvse(PolledBox):
     """One SmartEVSE that is polled."""
 
-    def __init__(self, config: ChargerConfig, orders: Orders) -> None:
+    def __init__(self, config: PolledConfig, orders: Orders) -> None:
         """Take the set-up; the box is not known before it answers."""
         super().__init__(config, orders)
         self._written: int | None = None
@@ -70,8 +69,8 @@ class PolledSmartEvse(PolledBox):
         self._written = None
 
     @override
-    def missed(self, now: float) -> None:
-        super().missed(now)
+    def on_missed(self, now: float) -> None:
+        super().on_missed(now)
         # It may have been switched off and on again.
         self._written = None
 
@@ -109,34 +108,34 @@ class PolledSmartEvse(PolledBox):
     # -- What must be so ---------------------------------------------------------------
 
     @override
-    def must_tend(self, now: float) -> bool:
+    def must_maintain(self, now: float) -> bool:
         return (
-            super().must_tend(now)
+            super().must_maintain(now)
             or self._must_stop()
             or self._must_write()
             or self._may_start(_NOTHING_NEW)
         )
 
     @override
-    async def tend(self, talk: Talk) -> None:
-        await self._stop_if_need_be(talk)
-        if talk.now >= self.configuration_due:
+    async def maintain(self, turn: Turn) -> None:
+        await self._stop_if_need_be(turn)
+        if turn.now >= self.configuration_due:
             # Once in a while the override is written anew: a short failure of its
             # power may have passed unseen.
             self._written = None
-        await super().tend(talk)
+        await super().maintain(turn)
         # What it may offer is known only now.
-        await self._stop_if_need_be(talk)
+        await self._stop_if_need_be(turn)
         if self._must_write():
-            await self._follow(talk, lambda: self.setpoint)
+            await self._follow(turn, lambda: self.setpoint)
         if self._may_start(_NOTHING_NEW):
             # What took its current away was no order: installation, settings, time.
-            await self._allow(talk, _NOTHING_NEW)
+            await self._allow(turn, _NOTHING_NEW)
 
-    async def _stop_if_need_be(self, talk: Talk) -> None:
+    async def _stop_if_need_be(self, turn: Turn) -> None:
         if self._must_stop():
             ours = self.effective_orders.allowed is not False
-            await self._stop(talk, ours=ours)
+            await self._stop(turn, ours=ours)
             await rest(0.0)
 
     def _must_stop(self) -> bool:
@@ -145,11 +144,11 @@ class PolledSmartEvse(PolledBox):
             return False
         return not is_stopped(self.known_dialect, self.status)
 
-    async def _stop(self, talk: Talk, *, ours: bool) -> None:
+    async def _stop(self, turn: Turn, *, ours: bool) -> None:
         """Turn access off; what our own limit takes away it may give back."""
         had_access = self.status is None or self.status.access
         try:
-            await self.set_access(talk, allowed=False)
+            await self.set_access(turn, allowed=False)
         except NotConfirmedError:
             self.notice(Fault.LIMIT_NOT_TAKEN, present=True)
             raise
@@ -187,7 +186,7 @@ class PolledSmartEvse(PolledBox):
 
     # -- The current -----------------------------------------------------------------
 
-    async def _follow(self, talk: Talk, wanted: Callable[[], Setpoint]) -> None:
+    async def _follow(self, turn: Turn, wanted: Callable[[], Setpoint]) -> None:
         """Write the override; while a car charges, until it is read back.
 
         A box that goes on offering more is stopped: a limit is a promise. Raises
@@ -195,19 +194,19 @@ class PolledSmartEvse(PolledBox):
         """
         told = None
         for _ in range(WRITES):
-            await self.reach(talk)
+            await self.reach(turn)
             status = self.status
             if status is None:
                 continue
             if self._fell_back:
                 self.statistics.reasserted += 1
                 self._fell_back = False
-            told = await self._write_current(talk, status, wanted)
+            told = await self._write_current(turn, status, wanted)
             if status.raw_state not in CHARGING:
                 return
             if self.known_dialect is not Dialect.LATER:
                 await rest(LOOK_AGAIN)
-            await self._settle(talk, wanted)
+            await self._settle(turn, wanted)
             status = self.status
             setpoint = wanted()
             if (
@@ -218,9 +217,9 @@ class PolledSmartEvse(PolledBox):
             ):
                 return
             await rest(0.0)
-        await self._give_up(talk, judged=told == tenths(wanted()))
+        await self._give_up(turn, judged=told == tenths(wanted()))
 
-    async def _give_up(self, talk: Talk, *, judged: bool) -> None:
+    async def _give_up(self, turn: Turn, *, judged: bool) -> None:
         """Stop a box that does not follow; ``judged``: it had its time.
 
         Raises NotConfirmedError, or SupersededError where a newer order came.
@@ -233,7 +232,7 @@ class PolledSmartEvse(PolledBox):
             message = "a newer limit came first"
             raise SupersededError(message)
         offers = offered(self.known_dialect, status)
-        await self._stop(talk, ours=True)
+        await self._stop(turn, ours=True)
         self._defied = offers
         self.notice(Fault.LIMIT_NOT_TAKEN, present=True)
         message = (
@@ -244,7 +243,7 @@ class PolledSmartEvse(PolledBox):
         raise NotConfirmedError(message)
 
     async def _write_current(
-        self, talk: Talk, status: Status, wanted: Callable[[], Setpoint]
+        self, turn: Turn, status: Status, wanted: Callable[[], Setpoint]
     ) -> int:
         """Write the override; return what was sent, 0.1 A."""
         dialect = self.known_dialect
@@ -258,27 +257,27 @@ class PolledSmartEvse(PolledBox):
             sent.append(tenths(setpoint))
             return write_current(self.config.address, dialect, setpoint)
 
-        answer = await self.write(talk, request, MAPS[dialect].current_register)
+        answer = await self.write(turn, request, MAPS[dialect].current_register)
         self._written = None if answer is None else sent[-1]
         return sent[-1]
 
-    async def _settle(self, talk: Talk, wanted: Callable[[], Setpoint]) -> None:
+    async def _settle(self, turn: Turn, wanted: Callable[[], Setpoint]) -> None:
         """Look until the box offers what was written, or had the time to."""
         if self.known_dialect is Dialect.LATER:
             # Looking sooner would keep it from following; a poll may look for us.
-            written_at = talk.now
+            written_at = turn.now
             while self._looked_at < written_at:
-                while (pause := self.minimum_pause(talk.now)) > 0:
+                while (pause := self.minimum_pause(turn.now)) > 0:
                     await rest(pause)
                 if self._looked_at < written_at:
-                    await self.see(talk)
+                    await self.see(turn)
             return
-        until = talk.now + SETTLING
+        until = turn.now + SETTLING
         while True:
-            await self.see(talk)
+            await self.see(turn)
             status = self.status
             if (
-                talk.now >= until
+                turn.now >= until
                 or status is None
                 or status.raw_state not in CHARGING
                 or offered(self.known_dialect, status) == wanted().current
@@ -289,26 +288,26 @@ class PolledSmartEvse(PolledBox):
     # -- Orders ----------------------------------------------------------------------
 
     @override
-    async def impose(self, talk: Talk, orders: Orders, change: OrderChange) -> None:
+    async def apply(self, turn: Turn, orders: Orders, change: OrderChange) -> None:
         with self.conversing():
-            await self._prepare(talk, change)
+            await self._prepare(turn, change)
             if self._wanted(change).paused:
                 if self._must_pause(change):
                     ours = orders.allowed is not False
-                    await self._stop(talk, ours=ours)
+                    await self._stop(turn, ours=ours)
                 return
-            await self._allow(talk, change)
+            await self._allow(turn, change)
 
-    async def _prepare(self, talk: Talk, change: OrderChange) -> None:
+    async def _prepare(self, turn: Turn, change: OrderChange) -> None:
         """See how the box is now; the user's pause goes out sooner."""
-        await self.reach(talk)
+        await self.reach(turn)
         if change.allowed is False:
             return
-        await self.see(talk)
+        await self.see(turn)
         await rest(0.0)
         if self.configuration is None:
             # Without its own limits it would get 6 A first.
-            await self.read_configuration(talk)
+            await self.read_configuration(turn)
 
     def _must_pause(self, change: OrderChange) -> bool:
         """Return whether a pause has to be said: the user's always, at once."""
@@ -317,15 +316,15 @@ class PolledSmartEvse(PolledBox):
         )
 
     def _wanted(self, change: OrderChange) -> Setpoint:
-        return clamp(self.sought(change), self.limits)
+        return clamp(self.order_to_send(change), self.limits)
 
-    async def _allow(self, talk: Talk, change: OrderChange) -> None:
+    async def _allow(self, turn: Turn, change: OrderChange) -> None:
         """Let the box follow orders that let a car charge."""
 
         def wanted() -> Setpoint:
             return self._wanted(change)
 
-        await self._follow(talk, wanted)
+        await self._follow(turn, wanted)
         await rest(0.0)
         if not self._may_start(change):
             return
@@ -334,7 +333,7 @@ class PolledSmartEvse(PolledBox):
             # Not where a pause came meanwhile: that one is on its way.
             return not (wanted().paused or self.leaves)
 
-        await self.set_access(talk, allowed=True, still=still)
+        await self.set_access(turn, allowed=True, still=still)
         self._limit_paused = False
         self._defied = None
 
@@ -360,7 +359,7 @@ class PolledSmartEvse(PolledBox):
             await super().command(command, value)
             return
         conversation = mode_conversation(self, value)
-        await self.run(self.turns(conversation), persistence=Persistence.REPEATABLE)
+        await self.run(conversation, persistence=Persistence.REPEATABLE)
 
 
 __all__ = ["PolledConfig", "PolledSmartEvse"]

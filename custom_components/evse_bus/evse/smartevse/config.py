@@ -27,14 +27,6 @@ class SmartEvseConfig(ChargerConfig):
             raise ValueError(message)
 
 
-def smartevse_config(config: ChargerConfig) -> SmartEvseConfig:
-    """Return the set-up as this protocol's own; TypeError for another one's."""
-    if not isinstance(config, SmartEvseConfig):
-        message = f"{config.name} is not set up as a SmartEVSE"
-        raise TypeError(message)
-    return config
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PolledConfig(SmartEvseConfig):
     """A SmartEVSE without load balancing, or one that is its own master."""
@@ -47,14 +39,6 @@ class PolledConfig(SmartEvseConfig):
         if self.address not in (0, 1):
             message = f"{self.address} is the address of a slave; polled are 0 and 1"
             raise ValueError(message)
-
-
-def polled_config(config: ChargerConfig) -> PolledConfig:
-    """Return the set-up as this protocol's own; TypeError for another one's."""
-    if not isinstance(config, PolledConfig):
-        message = f"{config.name} is not set up as a polled SmartEVSE"
-        raise TypeError(message)
-    return config
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

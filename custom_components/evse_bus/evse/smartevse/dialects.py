@@ -22,7 +22,7 @@ class Dialect(StrEnum):
     V2_17 = "2.17"
     V2_20 = "2.20"
     LATER = "later"
-    """Later 2.x, and 3.x."""
+    """FollowUp 2.x, and 3.x."""
 
 
 @dataclass(frozen=True, slots=True)

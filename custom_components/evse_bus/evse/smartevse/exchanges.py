@@ -1,20 +1,20 @@
 """One exchange with a box: a block read, a register written."""
 
 from ..errors import ReplyTimeoutError
-from ..exchange import Request, Talk
+from ..exchange import Request, Turn
 from .dialects import Block
 from .registers import read_answer, read_request, write_answer
 
 
-async def read(talk: Talk, unit: int, block: Block) -> bytes:
+async def read(turn: Turn, unit: int, block: Block) -> bytes:
     """Return the bytes of a block.
 
-    Raises ExchangeRefusedError and what `Talk.exchange` raises.
+    Raises ExchangeRefusedError and what `Turn.exchange` raises.
     """
-    return await talk.exchange(read_request(unit, block), read_answer(unit, block))
+    return await turn.exchange(read_request(unit, block), read_answer(unit, block))
 
 
-async def write(talk: Talk, unit: int, request: Request, register: int) -> bool | None:
+async def write(turn: Turn, unit: int, request: Request, register: int) -> bool | None:
     """Write one register; only a read-back tells whether it was taken.
 
     True: the box says so; False: it says no, and may have taken it all the same;
@@ -22,6 +22,6 @@ async def write(talk: Talk, unit: int, request: Request, register: int) -> bool 
     register, LineBusyError and LineLostError.
     """
     try:
-        return await talk.exchange(request, write_answer(unit, register))
+        return await turn.exchange(request, write_answer(unit, register))
     except ReplyTimeoutError:
         return None

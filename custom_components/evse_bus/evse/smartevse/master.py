@@ -14,10 +14,11 @@ import logging
 from math import inf
 from typing import TYPE_CHECKING, Final, cast, override
 
-from ..duty import Duty
+from ..charger import Charger
 from ..errors import LineBusyError, NotAvailableError
-from ..exchange import Request, Talk
+from ..exchange import Request, Turn
 from ..framing import Frame
+from ..master import BusMaster
 from ..modbus import ModbusFrame
 from ..model import Fault, Supply
 from .balancing import CURRENTS, broadcast, decode_request, is_foreign_broadcast
@@ -74,7 +75,7 @@ class _Phase(Enum):
     HUSHED = auto()
 
 
-class Master(Duty):
+class Master(BusMaster):
     """The broadcast, and what all slaves together may draw."""
 
     def __init__(self, supply: Supply) -> None:
@@ -86,6 +87,7 @@ class Master(Duty):
         self._phase = _Phase.LISTENING
         self._planned = 0.0
         self._unknown_until = inf
+        self._slaves: list[Member] = []
         self._draws: dict[int, Draw] = {}
         self._looked_at: set[int] = set()
         self._sent: tuple[int, ...] = ()
@@ -131,9 +133,19 @@ class Master(Duty):
     @property
     def slaves(self) -> list[Member]:
         """Return the slaves that are set up; nothing else is on this bus."""
-        if self.bus is None:
-            return []
-        return cast("list[Member]", list(self.bus.chargers.values()))
+        return list(self._slaves)
+
+    @override
+    def added(self, charger: Charger) -> None:
+        slave = cast("Member", charger)
+        self._slaves.append(slave)
+        slave.join(self)
+
+    @override
+    def removed(self, charger: Charger) -> None:
+        slave = cast("Member", charger)
+        self._slaves.remove(slave)
+        slave.join(None)
 
     def draw(self, unit: int) -> Draw:
         """Return what is known of the current of one unit."""
@@ -251,7 +263,7 @@ class Master(Duty):
     def _speak_now(self) -> None:
         self.slot.ready = min(self.slot.ready, self.now)
         if self.bus is not None:
-            self.bus.look_again()
+            self.bus.reschedule()
 
     def _words(self, now: float) -> tuple[int, ...]:
         """Return the values of the next broadcast, 0.1 A, for units 1 to 4."""
@@ -289,17 +301,17 @@ class Master(Duty):
         self._has_spoken.set()
         return raw
 
-    async def speak(self, talk: Talk) -> None:
-        """Broadcast in somebody's turn; raises what `Talk.send` raises.
+    async def speak(self, turn: Turn) -> None:
+        """Broadcast in somebody's turn; raises what `Turn.send` raises.
 
         Nothing is said before we have looked at the slaves.
         """
         if self._phase is _Phase.SPEAKING:
-            await talk.send(partial(self.unless_silent, self.frame))
+            await turn.send(partial(self.unless_silent, self.frame))
 
     @override
-    async def turn(self, talk: Talk) -> None:
-        now = talk.now
+    async def turn(self, turn: Turn) -> None:
+        now = turn.now
         if self._phase in (_Phase.LISTENING, _Phase.HUSHED):
             self._look(now)
             return
@@ -313,10 +325,10 @@ class Master(Duty):
             self._wait(self._planned)
             return
         try:
-            await self.speak(talk)
+            await self.speak(turn)
         except LineBusyError:
             # The patience for silence is over, the duty is not: again at once.
-            self._plan(talk.now, talk.now)
+            self._plan(turn.now, turn.now)
             self._is_planned = True
             raise
         self._next(now)
@@ -390,7 +402,7 @@ class Master(Duty):
         self._wait(now + (LOOKING if self.slaves else 0.0))
 
     @override
-    def heard(self, frame: Frame) -> bool:
+    def on_unsolicited(self, frame: Frame) -> bool:
         if not isinstance(frame, ModbusFrame):
             return False
         now = self.now
@@ -415,4 +427,4 @@ class Master(Duty):
         self.notice(Fault.SECOND_MASTER, present=True)
         if fresh and self.bus is not None:
             _LOGGER.warning("%s: %s", self.bus.name, _OTHER_MASTER)
-            self.bus.hush(_OTHER_MASTER)
+            self.bus.silence(_OTHER_MASTER)

@@ -4,8 +4,9 @@ One exchange a turn: on a bus that runs already the broadcasts go on between.
 """
 
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from ..bus import Bus
 from ..errors import (
     ExchangeError,
     ExchangeRefusedError,
@@ -15,19 +16,16 @@ from ..errors import (
     NotAvailableError,
     ReplyTimeoutError,
 )
-from ..exchange import Talk
-from ..found import FoundCharger, ScanReport
+from ..exchange import Turn
 from ..model import ChargerConfig, Fault, Orders, Setting
+from ..protocol import Progress
+from ..scan import FoundCharger, ScanResult
 from .balancing import SLAVES
 from .dialects import MAPS, Block, Dialect
 from .exchanges import read
 from .probing import Probe
 from .readings import charger_info
 from .registers import Status, decode_configuration, decode_status
-
-if TYPE_CHECKING:
-    from ..bus import Bus
-    from ..protocol import Progress
 
 ASKED: Final = 3
 """How often a unit is asked that stays silent: right after it was switched on, or in
@@ -36,7 +34,7 @@ the midst of a request of its own, a box may miss one."""
 
 async def scan(
     bus: Bus, config: ChargerConfig, orders: Orders, progress: Progress
-) -> ScanReport:
+) -> ScanResult:
     """Look for slaves at units 2 to 4; nothing is written.
 
     ``config`` and ``orders`` are not needed: every box can be read without setting
@@ -61,14 +59,14 @@ async def scan(
         except NotAvailableError:
             if not _other_master(bus):
                 raise
-            return ScanReport(other_master=True)
+            return ScanResult(other_master=True)
         else:
             (found if dialect is Dialect.V2_17 else unsupported).append(charger)
         progress((index + 1) / len(SLAVES))
     if not found and not unsupported and len(garbled) == len(SLAVES):
         # No collision is at all three: the line does not fit.
-        return ScanReport(unreadable=True)
-    return ScanReport(
+        return ScanResult(unreadable=True)
+    return ScanResult(
         found=tuple(found),
         unsupported=tuple(unsupported),
         duplicates=tuple(garbled),
@@ -76,7 +74,7 @@ async def scan(
 
 
 def _other_master(bus: Bus) -> bool:
-    return bus.duty is not None and Fault.SECOND_MASTER in bus.duty.noticed
+    return bus.master is not None and Fault.SECOND_MASTER in bus.master.noticed
 
 
 async def _look_at(bus: Bus, unit: int) -> tuple[FoundCharger, Dialect]:
@@ -125,5 +123,5 @@ async def _read(bus: Bus, unit: int, block: Block) -> bytes:
     raise ReplyTimeoutError
 
 
-async def _ask(unit: int, block: Block, talk: Talk) -> bytes:
-    return await read(talk, unit, block)
+async def _ask(unit: int, block: Block, turn: Turn) -> bytes:
+    return await read(turn, unit, block)

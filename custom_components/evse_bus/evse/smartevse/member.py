@@ -10,12 +10,11 @@ from functools import partial
 from math import inf
 from typing import ClassVar, Final, override
 
+from ..conversation import FollowUp
 from ..errors import NotAvailableError
-from ..exchange import Request, Talk
-from ..jobs import Later
+from ..exchange import Request, Turn
 from ..model import (
     Capability,
-    ChargerConfig,
     Fault,
     Limits,
     OrderChange,
@@ -26,6 +25,7 @@ from ..model import (
 from ..safety import Setpoint, clamp
 from .balancing import RequestKind
 from .box import SmartEvseBox
+from .config import SlaveConfig
 from .dialects import Block, Dialect
 from .master import Master
 from .registers import Status, read_answer, read_request, tenths
@@ -40,12 +40,13 @@ LOOK_FOR_OTHERS: Final = 30.0
 """Pause between two looks at a box whose firmware cannot be used, s."""
 
 
-class Member(SmartEvseBox):
+class Member(SmartEvseBox[SlaveConfig]):
     """One slave, as far as its master knows and asks it."""
 
     pauses_hurry: ClassVar = True
+    follows_master: ClassVar = True
 
-    def __init__(self, config: ChargerConfig, orders: Orders) -> None:
+    def __init__(self, config: SlaveConfig, orders: Orders) -> None:
         """Take the set-up; the box has no current before the master shares it."""
         super().__init__(config, orders)
         self.share = 0.0
@@ -54,6 +55,7 @@ class Member(SmartEvseBox):
         """It speaks another dialect: it hears none of our broadcasts."""
         self.came = inf
         """When its car began, for who comes first."""
+        self._master: Master | None = None
         self._own_maximum: float | None = None
         self._promised_until = -inf
         self._withheld_at: float | None = None
@@ -74,11 +76,14 @@ class Member(SmartEvseBox):
     @property
     def master(self) -> Master:
         """Return the master; NotAvailableError without one."""
-        duty = self.bus.duty if self.bus is not None else None
-        if not isinstance(duty, Master):
+        if self._master is None:
             message = f"{self.config.name} is on no bus with a master"
             raise NotAvailableError(message)
-        return duty
+        return self._master
+
+    def join(self, master: Master | None) -> None:
+        """Take a master, or none."""
+        self._master = master
 
     @property
     @override
@@ -118,7 +123,7 @@ class Member(SmartEvseBox):
     def _standing(self) -> Orders:
         """Return the orders that count, with those that are just being confirmed."""
         if self._confirming is not None:
-            return self.sought(self._confirming)
+            return self.order_to_send(self._confirming)
         return self.effective_orders
 
     def setpoint_within(self, share: float) -> Setpoint:
@@ -184,7 +189,7 @@ class Member(SmartEvseBox):
         """Let it be read as soon as the bus is free."""
         self.slot.ready = self.slot.due = min(self.slot.ready, now)
         if self.bus is not None:
-            self.bus.look_again()
+            self.bus.reschedule()
 
     # -- What it tells -------------------------------------------------------------
 
@@ -194,29 +199,29 @@ class Member(SmartEvseBox):
         self._answering.clear()
 
     @override
-    async def poll(self, talk: Talk) -> Later[None] | None:
-        if self.is_foreign and talk.now < self._look_again_at:
+    async def poll(self, turn: Turn) -> FollowUp | None:
+        if self.is_foreign and turn.now < self._look_again_at:
             raise self._refusal()
-        return await super().poll(talk)
+        return await super().poll(turn)
 
     @override
-    async def read(self, talk: Talk, block: Block) -> bytes:
+    async def read(self, turn: Turn, block: Block) -> bytes:
         request = partial(read_request, self.unit, block)
-        return await talk.exchange(
+        return await turn.exchange(
             partial(self.master.unless_silent, request), read_answer(self.unit, block)
         )
 
     @override
-    async def write(self, talk: Talk, request: Request, register: int) -> bool | None:
+    async def write(self, turn: Turn, request: Request, register: int) -> bool | None:
         checked = partial(self.master.unless_silent, request)
-        return await super().write(talk, checked, register)
+        return await super().write(turn, checked, register)
 
     @override
-    async def _find_dialect(self, talk: Talk) -> None:
-        await super()._find_dialect(talk)
+    async def _find_dialect(self, turn: Turn) -> None:
+        await super()._find_dialect(turn)
         self.is_foreign = self.dialect is not Dialect.V2_17
         if self.is_foreign:
-            self._look_again_at = talk.now + LOOK_FOR_OTHERS
+            self._look_again_at = turn.now + LOOK_FOR_OTHERS
             self.set_unavailable()
             self.notice(Fault.UNSUPPORTED_FIRMWARE, present=True)
             raise self._refusal()
@@ -258,6 +263,6 @@ class Member(SmartEvseBox):
             self.notice(Fault.LIMIT_NOT_TAKEN, present=True)
 
     @override
-    def missed(self, now: float) -> None:
-        super().missed(now)
+    def on_missed(self, now: float) -> None:
+        super().on_missed(now)
         self.master.missed(self)

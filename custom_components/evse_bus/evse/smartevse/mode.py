@@ -3,18 +3,19 @@
 from functools import partial
 from typing import TYPE_CHECKING
 
+from ..conversation import Conversation, rest
 from ..errors import NotAvailableError, NotConfirmedError, RefusedOrderError
-from ..exchange import Talk
+from ..exchange import Turn
 from ..model import Mode
-from ..turns import Conversation, rest
 from .dialects import MAPS
 from .registers import write_mode
 
 if TYPE_CHECKING:
     from .box import SmartEvseBox
+    from .config import PolledConfig
 
 
-def mode_conversation(box: SmartEvseBox, value: object) -> Conversation:
+def mode_conversation(box: SmartEvseBox[PolledConfig], value: object) -> Conversation:
     """Return what sets the mode; RefusedOrderError for what is no mode."""
     try:
         mode = Mode(str(value))
@@ -24,29 +25,29 @@ def mode_conversation(box: SmartEvseBox, value: object) -> Conversation:
     return partial(_set_mode, box, mode)
 
 
-async def _set_mode(box: SmartEvseBox, mode: Mode, talk: Talk) -> None:
+async def _set_mode(box: SmartEvseBox[PolledConfig], mode: Mode, turn: Turn) -> None:
     with box.conversing():
-        await box.reach(talk)
-        await box.see(talk)
+        await box.reach(turn)
+        await box.see(turn)
         if _mode_of(box) is mode:
             return
         _check_changeable(box)
         await rest(0.0)
         dialect = box.known_dialect
         request = partial(write_mode, box.config.address, dialect, mode)
-        await box.write(talk, request, MAPS[dialect].mode_register)
+        await box.write(turn, request, MAPS[dialect].mode_register)
         await rest(0.0)
-        await box.see(talk)
+        await box.see(turn)
     if _mode_of(box) is not mode:
         message = f"{box.config.name} did not take the mode {mode}"
         raise NotConfirmedError(message)
 
 
-def _mode_of(box: SmartEvseBox) -> Mode | None:
+def _mode_of(box: SmartEvseBox[PolledConfig]) -> Mode | None:
     return box.status.mode if box.status is not None else None
 
 
-def _check_changeable(box: SmartEvseBox) -> None:
+def _check_changeable(box: SmartEvseBox[PolledConfig]) -> None:
     """Raise NotAvailableError where the box would ignore a write silently.
 
     In all dialects it does without load balancing, and in the mode normal.

@@ -11,14 +11,13 @@ from dataclasses import replace
 from functools import partial
 from typing import ClassVar, Final, override
 
+from ..conversation import FollowUp
 from ..errors import LineBusyError, SharedAddressError
-from ..exchange import Request, Talk
-from ..jobs import Later, Step
-from ..model import ChargerConfig, Fault, Orders, Persistence, Range, Setting
+from ..exchange import Request, Turn
+from ..model import Fault, Orders, Persistence, Range, Setting
 from ..schedule import Kind
-from ..turns import Conversation, in_turns
 from .box import SmartEvseBox
-from .config import polled_config
+from .config import PolledConfig
 from .dialects import Dialect
 from .timing import QUIET, TIMING
 
@@ -26,15 +25,17 @@ COMMANDS_FIRST: Final = 0.05
 """A poll comes so much later than the end of the quiet, s."""
 
 
-class PolledBox(SmartEvseBox):
+class PolledBox(SmartEvseBox[PolledConfig]):
     """One SmartEVSE that has no master, or is its own."""
 
     pauses_hurry: ClassVar = True
+    # No other charger has a deadline here, and one burst costs a later box one quiet.
+    bursts: ClassVar = True
     # A power failure opens access that was off: a box that is back is soon seen, and
     # one that hears us and is not heard still has its quiet.
     timing: ClassVar = replace(TIMING, backoff=QUIET, backoff_limit=QUIET)
 
-    def __init__(self, config: ChargerConfig, orders: Orders) -> None:
+    def __init__(self, config: PolledConfig, orders: Orders) -> None:
         """Take the set-up; the box is not known before it answers."""
         super().__init__(config, orders)
         self._needs_quiet = False
@@ -62,11 +63,6 @@ class PolledBox(SmartEvseBox):
 
     # -- When ------------------------------------------------------------------------
 
-    @override
-    def turns(self, conversation: Conversation) -> Step[None]:
-        # Nobody else has a deadline here, and one burst costs a later box one quiet.
-        return in_turns(conversation, in_one_go=True)
-
     @property
     @override
     def exchanges_per_turn(self) -> int:
@@ -93,18 +89,18 @@ class PolledBox(SmartEvseBox):
             self.slot.ready = self.slot.due = max(self.slot.ready, quiet)
 
     @override
-    async def poll(self, talk: Talk) -> Later[None] | None:
-        if self.minimum_pause(talk.now) > 0:
+    async def poll(self, turn: Turn) -> FollowUp | None:
+        if self.minimum_pause(turn.now) > 0:
             message = f"{self.config.name} is to be left alone: others have asked"
             raise LineBusyError(message)
-        return await super().poll(talk)
+        return await super().poll(turn)
 
     # -- Who else is there -------------------------------------------------------------
 
     @override
-    async def write(self, talk: Talk, request: Request, register: int) -> bool | None:
+    async def write(self, turn: Turn, request: Request, register: int) -> bool | None:
         self._check_alone()
-        return await super().write(talk, request, register)
+        return await super().write(turn, request, register)
 
     @property
     @override
@@ -128,13 +124,13 @@ class PolledBox(SmartEvseBox):
     # -- The end ---------------------------------------------------------------------
 
     @override
-    async def farewell(self, *, for_good: bool = False) -> None:
-        if for_good or not polled_config(self.config).stop_on_shutdown:
+    async def on_shutdown(self, *, removed: bool = False) -> None:
+        if removed or not self.config.stop_on_shutdown:
             return
         # A start half done would come to its end after this.
         self.leaves = True
         await self.run(
-            self.turns(partial(self.set_access, allowed=False)),
+            partial(self.set_access, allowed=False),
             persistence=Persistence.STANDING,
             kind=Kind.PAUSE,
         )

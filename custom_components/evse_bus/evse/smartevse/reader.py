@@ -8,6 +8,7 @@ from math import inf
 from typing import ClassVar, Final, override
 
 from ..charger import Charger
+from ..conversation import rest
 from ..errors import (
     ExchangeRefusedError,
     ImplausibleReplyError,
@@ -15,18 +16,16 @@ from ..errors import (
     ReplyTimeoutError,
     WrongChargerError,
 )
-from ..exchange import Talk
+from ..exchange import Turn
 from ..model import (
     MINIMUM_CURRENT,
     Capability,
-    ChargerConfig,
     Fault,
     Limits,
     Orders,
     Setting,
 )
-from ..turns import rest
-from .config import smartevse_config
+from .config import SmartEvseConfig
 from .dialects import MAPS, PROBE_A0, Block, Dialect
 from .exchanges import read
 from .probing import Probe
@@ -56,12 +55,12 @@ CONFIGURATION_RETRY: Final = 30.0
 """Pause after settings that could not be read, s."""
 
 
-class SmartEvseReader(Charger):
+class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
     """One SmartEVSE, as far as it is asked and not told."""
 
     timing: ClassVar = TIMING
 
-    def __init__(self, config: ChargerConfig, orders: Orders) -> None:
+    def __init__(self, config: C, orders: Orders) -> None:
         """Take the set-up; the box is not known before it answers."""
         super().__init__(config, orders)
         self.dialect: Dialect | None = None
@@ -120,32 +119,32 @@ class SmartEvseReader(Charger):
         self._plug_doubted_until = 0.0
 
     @override
-    def missed(self, now: float) -> None:
-        super().missed(now)
+    def on_missed(self, now: float) -> None:
+        super().on_missed(now)
         # Whoever answers next may be another one: read before anything is written.
         self.status = None
 
     # -- Who it is -----------------------------------------------------------------
 
-    async def reach(self, talk: Talk) -> None:
+    async def reach(self, turn: Turn) -> None:
         """Make sure that we know whom we talk to, and what state it is in.
 
         Raises ImplausibleReplyError for a box of no known dialect, WrongChargerError
         for another box, and what `read` raises.
         """
         if self.dialect is None:
-            await self._find_dialect(talk)
+            await self._find_dialect(turn)
             await rest(0.0)
         if self.status is None:
-            await self.see(talk)
+            await self.see(turn)
             await rest(0.0)
 
-    async def _find_dialect(self, talk: Talk) -> None:
-        found = smartevse_config(self.config).dialect
+    async def _find_dialect(self, turn: Turn) -> None:
+        found = self.config.dialect
         probe = Probe()
         while found is None:
             try:
-                await self._ask(talk, probe)
+                await self._ask(turn, probe)
             except ImplausibleReplyError:
                 self.notice(Fault.UNSUPPORTED_FIRMWARE, present=True)
                 raise
@@ -157,9 +156,9 @@ class SmartEvseReader(Charger):
         self.dialect = found
         self.info = charger_info(found, self._serial)
 
-    async def _ask(self, talk: Talk, probe: Probe) -> None:
+    async def _ask(self, turn: Turn, probe: Probe) -> None:
         try:
-            data = await self.read(talk, probe.ask)
+            data = await self.read(turn, probe.ask)
         except ExchangeRefusedError as error:
             probe.refused(error.code)
         except ReplyTimeoutError:
@@ -181,15 +180,15 @@ class SmartEvseReader(Charger):
             raise NotAvailableError(message)
         return self.dialect
 
-    async def read(self, talk: Talk, block: Block) -> bytes:
+    async def read(self, turn: Turn, block: Block) -> bytes:
         """Return the bytes of a block (see `exchanges.read`)."""
-        return await read(talk, self.config.address, block)
+        return await read(turn, self.config.address, block)
 
-    async def see(self, talk: Talk) -> None:
+    async def see(self, turn: Turn) -> None:
         """Look at the box; a lost answer is asked for again."""
         for last in (False,) * (LOOKS - 1) + (True,):
             try:
-                await self.look(talk)
+                await self.look(turn)
             except ReplyTimeoutError:
                 if last:
                     raise
@@ -197,7 +196,7 @@ class SmartEvseReader(Charger):
                 return
             await rest(LOOK_AGAIN)
 
-    async def look(self, talk: Talk) -> Status:
+    async def look(self, turn: Turn) -> Status:
         """Read the status, and keep it: one exchange.
 
         Raises ImplausibleReplyError for what cannot be (it changes nothing),
@@ -205,7 +204,7 @@ class SmartEvseReader(Charger):
         """
         dialect = self.known_dialect
         try:
-            status = decode_status(dialect, await self.read(talk, MAPS[dialect].status))
+            status = decode_status(dialect, await self.read(turn, MAPS[dialect].status))
         except ExchangeRefusedError as error:
             if error.code == ILLEGAL_ADDRESS:
                 # Its firmware is another one than a moment ago.
@@ -219,7 +218,7 @@ class SmartEvseReader(Charger):
         self._not_understood = 0
         self.notice(Fault.IMPLAUSIBLE, present=False)
         self._check_identity(status)
-        self.take(status, talk.now)
+        self.take(status, turn.now)
         return status
 
     def _lose_faith(self) -> None:
@@ -265,21 +264,21 @@ class SmartEvseReader(Charger):
 
     # -- What it keeps in its memory -------------------------------------------------
 
-    async def read_configuration(self, talk: Talk) -> None:
+    async def read_configuration(self, turn: Turn) -> None:
         """Read the settings; what is not told or cannot be changes nothing."""
         dialect = self.known_dialect
         told: dict[Block, bytes] = {}
         try:
             for block in MAPS[dialect].configuration:
-                told[block] = await self.read(talk, block)
+                told[block] = await self.read(turn, block)
                 await rest(0.0)
             configuration = decode_configuration(dialect, told)
         except ImplausibleReplyError, ReplyTimeoutError, ExchangeRefusedError:
             # Before they are known the limit is 6 A: then each poll tries again.
             pause = CONFIGURATION_RETRY if self.configuration is not None else 0.0
-            self.configuration_due = talk.now + pause
+            self.configuration_due = turn.now + pause
             return
         self.configuration = configuration
-        self.configuration_due = talk.now + CONFIGURATION_INTERVAL
+        self.configuration_due = turn.now + CONFIGURATION_INTERVAL
         if self.status is not None:
-            self.take(self.status, talk.now)
+            self.take(self.status, turn.now)

@@ -7,8 +7,9 @@ they stop, so there is nothing to poll. At unit 0 a box answers only in the dial
 """
 
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from ..bus import Bus
 from ..errors import (
     ExchangeError,
     ExchangeRefusedError,
@@ -17,18 +18,15 @@ from ..errors import (
     LineBusyError,
     ReplyTimeoutError,
 )
-from ..exchange import Talk
-from ..found import FoundCharger, ScanReport
+from ..exchange import Turn
 from ..model import ChargerConfig, Orders, Setting
+from ..protocol import Progress
+from ..scan import FoundCharger, ScanResult
 from .dialects import MAPS, Dialect
 from .exchanges import read
 from .probing import Probe
 from .readings import charger_info
 from .registers import Status, decode_configuration, decode_status
-
-if TYPE_CHECKING:
-    from ..bus import Bus
-    from ..protocol import Progress
 
 UNITS: Final = (1, 0)
 """The more common one first."""
@@ -40,7 +38,7 @@ ASKED_PATIENTLY: Final = 4
 
 async def scan(
     bus: Bus, config: ChargerConfig, orders: Orders, progress: Progress
-) -> ScanReport:
+) -> ScanResult:
     """Look for a box at both units; nothing is written.
 
     ``config`` and ``orders`` are not needed: every box can be read without setting
@@ -59,8 +57,8 @@ async def scan(
         progress((index + 1) / len(UNITS))
     if not found and len(garbled) == len(UNITS):
         # No collision is at both: the line does not fit.
-        return ScanReport(unreadable=True)
-    return ScanReport(found=tuple(found), duplicates=tuple(garbled))
+        return ScanResult(unreadable=True)
+    return ScanResult(found=tuple(found), duplicates=tuple(garbled))
 
 
 async def _look_at(bus: Bus, unit: int) -> tuple[FoundCharger | None, bool]:
@@ -81,7 +79,7 @@ async def _look_at(bus: Bus, unit: int) -> tuple[FoundCharger | None, bool]:
     return None, garbled >= ASKED
 
 
-async def _ask(unit: int, talk: Talk) -> FoundCharger:
+async def _ask(unit: int, turn: Turn) -> FoundCharger:
     """Return what the box at a unit is.
 
     Raises ImplausibleReplyError where no SmartEVSE answers, and what `read` raises.
@@ -89,27 +87,27 @@ async def _ask(unit: int, talk: Talk) -> FoundCharger:
     probe = Probe()
     while probe.found is None:
         try:
-            probe.told(await read(talk, unit, probe.ask))
+            probe.told(await read(turn, unit, probe.ask))
         except ExchangeRefusedError as error:
             probe.refused(error.code)
     dialect = probe.found
-    status = decode_status(dialect, await read(talk, unit, MAPS[dialect].status))
+    status = decode_status(dialect, await read(turn, unit, MAPS[dialect].status))
     info = charger_info(dialect, status.serial)
     return FoundCharger(
         address=unit,
         info=info,
         serial=info.serial,
-        maximum_current=await _maximum(talk, unit, dialect, status),
+        maximum_current=await _maximum(turn, unit, dialect, status),
     )
 
 
 async def _maximum(
-    talk: Talk, unit: int, dialect: Dialect, status: Status
+    turn: Turn, unit: int, dialect: Dialect, status: Status
 ) -> float | None:
     """Return the maximum that a box tells of itself, A; ``None``: not told."""
     try:
         told = {
-            block: await read(talk, unit, block)
+            block: await read(turn, unit, block)
             for block in MAPS[dialect].configuration
         }
         settings = decode_configuration(dialect, told).settings

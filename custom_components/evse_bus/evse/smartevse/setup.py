@@ -7,26 +7,27 @@ same conversation, before anything else.
 from functools import partial
 from typing import TYPE_CHECKING
 
+from ..conversation import Conversation, rest
 from ..errors import (
     EvseError,
     NotAvailableError,
     NotConfirmedError,
     RefusedOrderError,
 )
-from ..exchange import Talk
+from ..exchange import Turn
 from ..model import Setting
-from ..turns import Conversation, rest
 from .dialects import MAPS
 from .registers import write_setting
 
 if TYPE_CHECKING:
     from .box import SmartEvseBox
+    from .config import SmartEvseConfig
 
 
 class SetUp:
     """The conversation that sets one thing."""
 
-    def __init__(self, box: SmartEvseBox) -> None:
+    def __init__(self, box: SmartEvseBox[SmartEvseConfig]) -> None:
         """Take the box, for its state and its access."""
         self._box = box
 
@@ -49,35 +50,35 @@ class SetUp:
             raise RefusedOrderError(message)
         return partial(self._set, setting, value)
 
-    async def _set(self, setting: Setting, value: int, talk: Talk) -> None:
+    async def _set(self, setting: Setting, value: int, turn: Turn) -> None:
         box = self._box
         with box.conversing():
-            await self._look(talk)
+            await self._look(turn)
             if self._is_set(setting, value):
                 # What is set already is not written: the memory wears out.
                 return
             # Remembered until it is certain: answers may be lost, or the line.
             box.must_close |= box.status is not None and not box.status.access
-            await self._write(setting, value, talk)
+            await self._write(setting, value, turn)
             if box.must_close:
-                await self._close(talk)
-            await self._read_back(talk)
+                await self._close(turn)
+            await self._read_back(turn)
         if not self._is_set(setting, value):
             message = f"{box.config.name} did not take {setting} = {value}"
             raise NotConfirmedError(message)
 
-    async def _look(self, talk: Talk) -> None:
+    async def _look(self, turn: Turn) -> None:
         """Read access and settings as they are now."""
         box = self._box
-        await box.reach(talk)
-        await box.see(talk)
+        await box.reach(turn)
+        await box.see(turn)
         await rest(0.0)
-        await box.read_configuration(talk)
+        await box.read_configuration(turn)
 
-    async def _read_back(self, talk: Talk) -> None:
+    async def _read_back(self, turn: Turn) -> None:
         box = self._box
         box.configuration = None
-        await box.read_configuration(talk)
+        await box.read_configuration(turn)
         if box.configuration is None:
             # Nobody knows what it may offer now: to be read as soon as it can be.
             box.configuration_due = 0.0
@@ -86,22 +87,22 @@ class SetUp:
         configuration = self._box.configuration
         return configuration is not None and configuration.settings[setting] == value
 
-    async def _write(self, setting: Setting, value: int, talk: Talk) -> None:
+    async def _write(self, setting: Setting, value: int, turn: Turn) -> None:
         box = self._box
         dialect = box.known_dialect
         # Once, whatever the answer: the read-back tells whether it worked.
         await box.write(
-            talk,
+            turn,
             partial(write_setting, box.config.address, dialect, setting, value),
             MAPS[dialect].settings[setting].register,
         )
         await rest(0.0)
 
-    async def _close(self, talk: Talk) -> None:
+    async def _close(self, turn: Turn) -> None:
         """Turn access off again where the write has opened it."""
         box = self._box
         try:
-            await box.close_again(talk)
+            await box.close_again(turn)
             await rest(0.0)
         except EvseError as error:
             message = (

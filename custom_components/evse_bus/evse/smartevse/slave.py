@@ -11,14 +11,13 @@ from functools import partial
 from math import inf
 from typing import Final, override
 
+from ..conversation import FollowUp, nothing, rest
 from ..errors import EvseError, NotAvailableError, NotConfirmedError
-from ..exchange import Talk
+from ..exchange import Turn
 from ..framing import Frame
-from ..jobs import Later
 from ..modbus import ModbusFrame
 from ..model import Fault, OrderChange, Orders, Persistence
 from ..schedule import Kind
-from ..turns import in_turns, rest
 from .answers import ANSWER_BYTES, ANSWER_WITHIN, Answer
 from .balancing import RequestKind, SlaveRequest, acknowledge, decode_request
 from .dialects import Dialect
@@ -39,15 +38,15 @@ class SlaveSmartEvse(Member):
     # -- Access --------------------------------------------------------------------
 
     @override
-    def must_tend(self, now: float) -> bool:
-        return super().must_tend(now) or self._access_due() is not None
+    def must_maintain(self, now: float) -> bool:
+        return super().must_maintain(now) or self._access_due() is not None
 
     @override
-    async def tend(self, talk: Talk) -> None:
+    async def maintain(self, turn: Turn) -> None:
         due = self._access_due()
         if due is not None:
-            await self._turn(talk, due)
-        await super().tend(talk)
+            await self._turn(turn, due)
+        await super().maintain(turn)
 
     def _access_due(self) -> bool | None:
         """Return what its access must be set to; ``None``: it may stay as it is.
@@ -60,19 +59,19 @@ class SlaveSmartEvse(Member):
             return False if self._must_be_off() else None
         return True if self._is_ours and self.may_begin() else None
 
-    async def _turn(self, talk: Talk, allowed: bool) -> None:  # noqa: FBT001
+    async def _turn(self, turn: Turn, allowed: bool) -> None:  # noqa: FBT001
         """Set the access bit, and remember whether that was our own doing."""
         if not allowed:
             own = self._standing.allowed is not False
             if own:
                 # Somebody at the box may have been first: that is not ours to undo.
                 with suppress(EvseError):
-                    await self.look(talk)
+                    await self.look(turn)
                 await rest(0.0)
             had_access = self.status is None or self.status.access
             self._is_ours = own and (had_access or self._is_ours)
         still = self._may_be_on if allowed else self._must_be_off
-        await self.set_access(talk, allowed, still)
+        await self.set_access(turn, allowed, still)
         if allowed:
             self._is_ours = False
 
@@ -94,35 +93,35 @@ class SlaveSmartEvse(Member):
     # -- Orders --------------------------------------------------------------------
 
     @override
-    async def impose(self, talk: Talk, orders: Orders, change: OrderChange) -> None:
+    async def apply(self, turn: Turn, orders: Orders, change: OrderChange) -> None:
         self._confirming = change
         try:
             with self.conversing():
-                await self.reach(talk)
+                await self.reach(turn)
                 if change.allowed is False:
                     # The user's word: nothing of it is ours to give back.
                     self._withheld_at = None
                 if self.wanted.paused:
-                    await self._turn(talk, allowed=False)
+                    await self._turn(turn, allowed=False)
                     return
                 starts = change.allowed is True or self._is_ours
                 if starts and not self.withheld:
-                    await self._turn(talk, allowed=True)
+                    await self._turn(turn, allowed=True)
                     await rest(0.0)
-                await self._follow(talk)
+                await self._follow(turn)
         finally:
             self._confirming = None
             self._changed()
 
-    async def _follow(self, talk: Talk) -> None:
+    async def _follow(self, turn: Turn) -> None:
         """Broadcast its current until it is read back, at it or below it.
 
         More than its share is not waited for. Raises NotConfirmedError.
         """
         for _ in range(BROADCASTS):
-            await self.master.speak(talk)
+            await self.master.speak(turn)
             await rest(0.0)
-            await self.see(talk)
+            await self.see(turn)
             if self.status and round(self.status.current * 10) <= tenths(self.wanted):
                 self.notice(Fault.LIMIT_NOT_TAKEN, present=False)
                 return
@@ -139,11 +138,11 @@ class SlaveSmartEvse(Member):
     # -- The end -------------------------------------------------------------------
 
     @override
-    async def farewell(self, *, for_good: bool = False) -> None:
-        if for_good:
+    async def on_shutdown(self, *, removed: bool = False) -> None:
+        if removed:
             # It would follow the broadcasts to the others, and nobody would count it.
             await self.run(
-                in_turns(partial(self.set_access, allowed=False)),
+                partial(self.set_access, allowed=False),
                 persistence=Persistence.STANDING,
                 kind=Kind.PAUSE,
             )
@@ -151,7 +150,7 @@ class SlaveSmartEvse(Member):
     # -- Its requests --------------------------------------------------------------
 
     @override
-    def on_unsolicited(self, frame: Frame) -> Later[None] | None:
+    def on_unsolicited(self, frame: Frame) -> FollowUp | None:
         if not isinstance(frame, ModbusFrame):
             return None
         request = decode_request(frame)
@@ -161,23 +160,23 @@ class SlaveSmartEvse(Member):
         if self.dialect is not Dialect.V2_17:
             # Nothing is said to a box that we have not read.
             self.look_soon(now)
-            return Later(0.0, _nothing, 0.0)
+            return FollowUp(nothing)
         if request.kind in (RequestKind.B, RequestKind.C):
             self._own_maximum = request.wanted
             if self.may_begin() and self._is_refused:
                 # Opened at the box since, or closed since it asked: to be read first.
                 # It asks again in a second.
                 self.look_soon(now)
-                return Later(0.0, _nothing, 0.0)
+                return FollowUp(nothing)
         else:
             # What it leaves the others need not wait for.
             self._promised_until = -inf
             self.look_soon(now)
         if now < self._answering.get(request.kind, -inf):
-            return Later(0.0, _nothing, 0.0)
+            return FollowUp(nothing)
         self._answering[request.kind] = now + ANSWER_WITHIN
         answer = Answer(self, request, now)
-        return Later(0.0, answer.give, self.bus.wire.send_time(ANSWER_BYTES))
+        return FollowUp(answer.give, worst_case=self.bus.wire.send_time(ANSWER_BYTES))
 
     def answered(self, request: SlaveRequest) -> None:
         """Note that a request needs no answer any more."""
@@ -216,7 +215,3 @@ class SlaveSmartEvse(Member):
         self.came = min(self.came, now)
         self._promised_until = now + PROMISE
         return acknowledge(request, setpoint)
-
-
-async def _nothing(_talk: Talk) -> None:
-    """Say nothing."""

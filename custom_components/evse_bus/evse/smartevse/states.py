@@ -74,7 +74,7 @@ def state_of(dialect: Dialect, raw_state: str) -> State:
 def tells_plug(dialect: Dialect, status: Status) -> bool:
     """Return whether the state says if a car is plugged in.
 
-    Later boxes keep the pilot in sight (B1); before, ``A`` also stands for "stopped"
+    FollowUp boxes keep the pilot in sight (B1); before, ``A`` also stands for "stopped"
     where access is off or an error is set.
     """
     if status.raw_state != UNPLUGGED or dialect is Dialect.LATER:

@@ -7,15 +7,15 @@ from typing import override
 import pytest
 
 from custom_components.evse_bus.evse.bus import Bus
-from custom_components.evse_bus.evse.duty import Duty
+from custom_components.evse_bus.evse.conversation import FollowUp
 from custom_components.evse_bus.evse.errors import (
     LineBusyError,
     LineLostError,
     NotAvailableError,
 )
-from custom_components.evse_bus.evse.exchange import Talk
+from custom_components.evse_bus.evse.exchange import Turn
 from custom_components.evse_bus.evse.framing import Frame
-from custom_components.evse_bus.evse.jobs import Later
+from custom_components.evse_bus.evse.master import BusMaster
 from custom_components.evse_bus.evse.model import Fault, OrderChange
 from custom_components.evse_bus.evse.schedule import Kind
 
@@ -34,7 +34,7 @@ SLACK = 0.02
 CALL = b"@\xffB\x00"
 
 
-class Beat(Duty):
+class Beat(BusMaster):
     """Says ``B`` to everybody every two seconds."""
 
     def __init__(self) -> None:
@@ -64,15 +64,15 @@ class Beat(Duty):
         self._next(now)
 
     @override
-    async def turn(self, talk: Talk) -> None:
+    async def turn(self, turn: Turn) -> None:
         if self.raises:
             raise self.raises.pop()
         if self.silent:
             self._next(self.quiet_until)
             return
         planned = self.slot.ready
-        await talk.send(CALL)
-        self.beats.append(talk.sent_at or 0.0)
+        await turn.send(CALL)
+        self.beats.append(turn.sent_at or 0.0)
         self._next(planned + PERIOD)
 
     def _next(self, at: float) -> None:
@@ -80,12 +80,12 @@ class Beat(Duty):
         self.slot.start_by = at + SLACK
 
     @override
-    def heard(self, frame: Frame) -> bool:
+    def on_unsolicited(self, frame: Frame) -> bool:
         if isinstance(frame, Telegram) and frame.command == ord("!"):
             self.quiet_until = now() + 60
             self.notice(Fault.SECOND_MASTER, present=True)
             assert self.bus is not None
-            self.bus.hush("somebody else is master")
+            self.bus.silence("somebody else is master")
             self._next(self.quiet_until)
             return True
         return False
@@ -97,7 +97,7 @@ class BeatScene(Scene):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.beat = Beat()
-        bus = Bus(self.line, TelegramFramer(), TIMING, "simulated", duty=self.beat)
+        bus = Bus(self.line, TelegramFramer(), TIMING, "simulated", group=self.beat)
         for charger in tuple(self.bus.chargers.values()):
             bus.add(charger)
         self.bus = bus
@@ -190,8 +190,8 @@ def test_a_failed_turn_is_tried_again(
             assert bus.charger(1).available
 
     simulate(scene())
-    unforeseen = "its own turn failed unforeseen" in caplog.text
-    assert unforeseen == isinstance(error, RuntimeError)
+    unexpectedly = "the master's turn failed unexpectedly" in caplog.text
+    assert unexpectedly == isinstance(error, RuntimeError)
 
 
 def test_a_lost_port_ends_it_and_a_port_that_is_back_begins_it_anew() -> None:
@@ -216,11 +216,11 @@ def test_a_short_answer_to_an_unasked_frame_fits_before_a_deadline() -> None:
 
     class Short(SimulatedCharger):
         @override
-        def on_unsolicited(self, frame: Frame) -> Later[None] | None:
-            async def answer(talk: Talk) -> None:
-                self.asked.append(await talk.send(b"@\x01!\x00"))  # type: ignore[arg-type]
+        def on_unsolicited(self, frame: Frame) -> FollowUp | None:
+            async def answer(turn: Turn) -> None:
+                self.asked.append(await turn.send(b"@\x01!\x00"))  # type: ignore[arg-type]
 
-            return Later(0.0, answer, 0.002)
+            return FollowUp(answer, worst_case=0.002)
 
     async def scene() -> None:
         async with BeatScene(interval=1.0) as bus:

@@ -23,7 +23,7 @@ class FoundCharger:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ScanReport:
+class ScanResult:
     """What a scan of a bus found."""
 
     found: tuple[FoundCharger, ...] = ()

@@ -1,0 +1,82 @@
+"""Roles above single chargers: a group that shares one box, the master of a bus.
+
+A load-balancing master must broadcast every few seconds, or its slaves stop. Its turn
+belongs to the bus, not to one charger; it has a hard deadline of its own, and the
+master may silence the whole bus.
+"""
+
+from abc import ABC, abstractmethod
+
+from .charger import Charger, Scheduler
+from .exchange import Turn
+from .framing import Frame
+from .listeners import Observable
+from .model import Fault, Supply
+from .schedule import Kind, Slot
+from .statistics import ChargerStatistics
+
+
+class ChargerGroup:
+    """The owner of the state that all chargers of one bus have in common."""
+
+    bus: Scheduler | None = None
+    """The bus; set by it."""
+
+    def added(self, charger: Charger) -> None:
+        """Take in a charger that was put on the bus."""
+
+    def removed(self, charger: Charger) -> None:
+        """Let go of a charger that was taken off the bus."""
+
+
+class BusMaster(ChargerGroup, Observable, ABC):
+    """The master of a bus, with a recurring turn of its own."""
+
+    def __init__(self) -> None:
+        """Nothing is sent before the bus starts."""
+        super().__init__()
+        self.slot = Slot(kind=Kind.PAUSE)
+        self.statistics = ChargerStatistics()
+        self.noticed: frozenset[Fault] = frozenset()
+        """Faults of the whole bus."""
+
+    @property
+    @abstractmethod
+    def silent(self) -> bool:
+        """Return whether nothing may be sent on this bus outside the master's turn."""
+
+    @property
+    @abstractmethod
+    def refusal(self) -> str | None:
+        """Return why no command is accepted now; ``None``: commands are accepted."""
+
+    @abstractmethod
+    def on_line_open(self, now: float) -> None:
+        """Begin anew: the line was opened at this loop time, s."""
+
+    @abstractmethod
+    async def turn(self, turn: Turn) -> None:
+        """Have the recurring turn, and set in `slot` when it is due again.
+
+        Raises EvseError.
+        """
+
+    @abstractmethod
+    def failed(self, now: float) -> None:
+        """Set in `slot` when to try again: the turn raised."""
+
+    def on_unsolicited(self, frame: Frame) -> bool:  # noqa: ARG002
+        """Look at an unsolicited frame; return whether it was for the master."""
+        return False
+
+    async def change_supply(self, supply: Supply) -> None:
+        """Share this supply from now on; return when all chargers were informed.
+
+        Raises RefusedOrderError for an impossible supply.
+        """
+
+    def notice(self, fault: Fault, *, present: bool) -> None:
+        """Set or clear a fault of the whole bus; listeners hear of a change."""
+        if present != (fault in self.noticed):
+            self.noticed = self.noticed ^ {fault}
+            self.updated()
