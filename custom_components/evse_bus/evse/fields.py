@@ -119,6 +119,13 @@ class Number(Numeric[int]):
             raise self.refused(f"cannot be {value} {self.unit}".rstrip())
         return raw
 
+    @property
+    def span(self) -> tuple[int, int]:
+        """Return the lowest and the highest value that can be written."""
+        numbers = self.valid or self.possible or range(1 << 8 * self.width)
+        values = [self.sign * (raw - self.offset) for raw in (numbers[0], numbers[-1])]
+        return min(values), max(values)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scaled(Numeric[float]):

@@ -20,11 +20,11 @@ class Block:
 
 
 @dataclass(frozen=True, slots=True)
-class Word[V]:
-    """One register that holds one value."""
+class Word[K: Numeric[Any]]:
+    """A register that holds one value."""
 
     register: int
-    kind: Numeric[V]
+    kind: K
 
 
 class Registers[T](BitStruct[T]):

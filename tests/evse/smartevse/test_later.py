@@ -38,7 +38,7 @@ def test_polled_without_quiet_it_stops_with_no_comm() -> None:
         await scene.charge()
         await scene.polled(2)
         await scene.bus.stop()
-        request = read_request(1, MAPS[LATER].status)
+        request = read_request(1, MAPS[LATER].status.block)
         errors = 0
         await scene.line.open()
         for _ in range(8):
@@ -95,7 +95,7 @@ def test_other_requests_on_the_line_count_as_well() -> None:
         await scene.charge()
 
         async def ask(turn: Turn) -> None:
-            await turn.send(read_request(5, MAPS[LATER].status))
+            await turn.send(read_request(5, MAPS[LATER].status.block))
 
         for _ in range(20):
             await asyncio.sleep(9.1)

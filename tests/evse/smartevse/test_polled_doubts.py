@@ -220,7 +220,7 @@ def test_a_status_that_comes_late_is_no_configuration() -> None:
         await scene.charge()
         await scene.polled(2)
         scene.charger.configuration_due = 0.0
-        request = read_request(0, MAPS[V2_17].status)
+        request = read_request(0, MAPS[V2_17].status.block)
         status = scene.box.controller.receive(request, now())
         assert status is not None
         write = scene.line.write

@@ -10,7 +10,12 @@ from custom_components.evse_bus.evse.errors import (
     ImplausibleReplyError,
     RefusedOrderError,
 )
-from custom_components.evse_bus.evse.modbus import ModbusFrame, RtuFramer, rtu_frame
+from custom_components.evse_bus.evse.modbus import (
+    READ_INPUT_REGISTERS,
+    ModbusFrame,
+    RtuFramer,
+    rtu_frame,
+)
 from custom_components.evse_bus.evse.model import (
     CurrentLimit,
     Fault,
@@ -20,17 +25,17 @@ from custom_components.evse_bus.evse.model import (
     Setting,
     Status as Word,
 )
+from custom_components.evse_bus.evse.registers import Block
 from custom_components.evse_bus.evse.safety import clamp
 from custom_components.evse_bus.evse.smartevse.dialects import (
     MAPS,
     PROBE_A0,
     PROBE_A9,
-    Block,
     Dialect,
+    Status,
 )
 from custom_components.evse_bus.evse.smartevse.probing import Probe
 from custom_components.evse_bus.evse.smartevse.registers import (
-    Status,
     decode_configuration,
     decode_status,
     read_answer,
@@ -75,7 +80,10 @@ def later(state: int = 2, *, serial: int = 4711, kelvin: int = 293) -> bytes:
 def test_requests_as_recorded() -> None:
     assert read_request(0, PROBE_A0).hex() == "000400a0000931ff"
     assert read_request(1, PROBE_A0).hex() == "010400a00009302e"
-    assert read_request(0, Block(0xC0, 9)).hex() == "000400c0000931e1"
+    assert (
+        read_request(0, Block(0xC0, 9, READ_INPUT_REGISTERS)).hex()
+        == "000400c0000931e1"
+    )
     written = write_current(0, V2_17, setpoint(14.0))
     assert written.hex() == "001000a6000102008cb2a3"
     assert write_access(0, V2_17, allowed=False).hex() == "001000a70001020000b2d7"
@@ -126,7 +134,7 @@ def test_configuration_as_recorded() -> None:
 
 def test_the_malformed_exceptions() -> None:
     with pytest.raises(ExchangeRefusedError) as refused:
-        read_answer(0, Block(0xB0, 1))(frame("000402f2c1"))
+        read_answer(0, Block(0xB0, 1, READ_INPUT_REGISTERS))(frame("000402f2c1"))
     assert refused.value.code == 2
     accept = write_answer(0, 0xA6)
     # "No", and it is obeyed all the same: perhaps.
@@ -187,16 +195,22 @@ _word = st.one_of(st.integers(0, 12), st.integers(0x41, 0x54), st.integers(0, 0x
 @each
 @given(values=st.lists(_word, min_size=9, max_size=9), more=st.lists(_word, max_size=3))
 def test_nearly_a_status(dialect: Dialect, values: list[int], more: list[int]) -> None:
-    layout = MAPS[dialect]
-    count = layout.status.count
-    told = (values + more + [0] * 3)[:count]
+    table = MAPS[dialect].status
+    told = (values + more + [0] * 3)[: table.block.words]
+
+    def word(name: str) -> int:
+        return told[table.words[name].register - table.block.register]
+
     try:
         status = decode_status(dialect, words(*told))
     except ImplausibleReplyError:
         return
-    assert told[0] in layout.states
-    assert status.current == told[layout.current] / 10
-    assert status.access is (told[layout.access] == 1)
+    assert status.raw_state == table.words["raw_state"].kind.value(told[0])
+    assert status.current == word("current") / 10
+    assert status.access is (word("access") == 1)
+    assert word("access") in (0, 1)
+    assert word("error") < 256
+    assert word("maximum") <= 160
 
 
 @each
@@ -210,8 +224,8 @@ def test_any_settings_are_in_their_range_or_held_back(
             *data.draw(
                 st.lists(
                     st.integers(0, 40) | st.integers(0, 0xFFFF),
-                    min_size=block.count,
-                    max_size=block.count,
+                    min_size=block.words,
+                    max_size=block.words,
                 )
             )
         )
@@ -222,11 +236,11 @@ def test_any_settings_are_in_their_range_or_held_back(
     except ImplausibleReplyError:
         return
     for setting, value in configuration.settings.items():
-        span = layout.settings[setting].range
-        assert span.minimum <= value <= span.maximum
+        word = layout.settings[setting]
+        lowest, highest = word.kind.span
+        assert lowest <= value <= highest
         # And it is written as it was read.
-        kept = layout.settings[setting]
-        assert kept.value(kept.word(value)) == value
+        assert word.kind.value(word.kind.raw(value)) == value
 
 
 def test_settings_that_are_not_all_told() -> None:
@@ -274,7 +288,7 @@ def test_without_a0_it_may_be_a_later_one() -> None:
     probe = Probe()
     probe.refused(2)
     assert probe.found is None
-    assert probe.ask == MAPS[LATER].status
+    assert probe.ask == MAPS[LATER].status.block
     probe.told(later())
     assert probe.found is LATER
 
@@ -333,7 +347,7 @@ def test_a_dialect_is_found_only_by_its_own_words(
     if probe.found is V2_20:
         assert PROBE_A9 in asked
     if probe.found is LATER:
-        assert MAPS[LATER].status in asked
+        assert MAPS[LATER].status.block in asked
 
 
 # -- States --------------------------------------------------------------------------

@@ -13,10 +13,15 @@ from typing import Any, Final
 import pytest
 
 from custom_components.evse_bus.evse.errors import ExchangeRefusedError
-from custom_components.evse_bus.evse.modbus import RtuFramer, write_registers
+from custom_components.evse_bus.evse.modbus import (
+    READ_INPUT_REGISTERS,
+    RtuFramer,
+    write_registers,
+)
 from custom_components.evse_bus.evse.model import CurrentLimit, Limits, Orders
+from custom_components.evse_bus.evse.registers import Block
 from custom_components.evse_bus.evse.safety import clamp
-from custom_components.evse_bus.evse.smartevse.dialects import PROBE_A0, Block, Dialect
+from custom_components.evse_bus.evse.smartevse.dialects import PROBE_A0, Dialect
 from custom_components.evse_bus.evse.smartevse.registers import (
     decode_configuration,
     decode_status,
@@ -132,14 +137,14 @@ def test_every_answer_is_known_for_what_it_is(
     unit, function = request_[:2]
     register = int.from_bytes(request_[2:4])
     if function == 4:
-        block = Block(register, int.from_bytes(request_[4:6]))
+        block = Block(register, int.from_bytes(request_[4:6]), function)
         if len(reply) == 5:
             with pytest.raises(ExchangeRefusedError):
                 read_answer(unit, block)(frame)
             return
         data = read_answer(unit, block)(frame)
         assert data is not None
-        assert len(data) == 2 * block.count
+        assert len(data) == 2 * block.words
     elif function == 0x10:
         # "Perhaps" for the override, which is obeyed; "yes" for the access bit.
         assert write_answer(unit, register)(frame) is (register == 0xA7), what
@@ -151,11 +156,10 @@ def test_the_factory_defaults() -> None:
         register, count = (int.from_bytes(request[i : i + 2]) for i in (2, 4))
         if register in (0xC0, 0xE0):
             (frame,) = RtuFramer().feed(reply)
-            data = read_answer(0, Block(register, count))(frame)
+            data = read_answer(0, Block(register, count, READ_INPUT_REGISTERS))(frame)
             assert data is not None
-            told[Block(register, 9 if register == 0xC0 else 3)] = (
-                data if register == 0xC0 else data[:6]
-            )
+            words = 9 if register == 0xC0 else 3
+            told[Block(register, words)] = data[: 2 * words]
     settings = decode_configuration(DIALECT, told).settings
     assert sorted(settings.values()) == [6, 13, 25]
 

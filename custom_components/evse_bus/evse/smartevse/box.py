@@ -86,7 +86,8 @@ class SmartEvseBox[C: SmartEvseConfig](SmartEvseReader[C]):
         if self.dialect is None or self.configuration is None:
             return {}
         ranges = {
-            setting: kept.range for setting, kept in MAPS[self.dialect].settings.items()
+            setting: Range(*word.kind.span)
+            for setting, word in MAPS[self.dialect].settings.items()
         }
         # No setting may promise the box more than its wiring carries.
         own = ranges[Setting.MAXIMUM_CURRENT]

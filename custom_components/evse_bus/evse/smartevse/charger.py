@@ -30,10 +30,10 @@ from ..model import (
 from ..safety import Setpoint, clamp
 from .box import WRITES
 from .config import PolledConfig
-from .dialects import MAPS, Dialect
+from .dialects import MAPS, Dialect, Status
 from .mode import mode_conversation
 from .polled import PolledBox
-from .registers import Status, tenths, write_current
+from .registers import tenths, write_current
 from .states import CHARGING, is_stopped, offered, state_of, tells_plug
 from .timing import LOOK_AGAIN, SETTLING
 

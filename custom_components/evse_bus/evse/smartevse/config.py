@@ -4,8 +4,7 @@ from dataclasses import dataclass
 
 from ..model import ChargerConfig
 from .balancing import SLAVES
-from .dialects import Dialect
-from .registers import UNITS
+from .dialects import UNITS, Dialect
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -2,7 +2,7 @@
 
 from ..errors import ReplyTimeoutError
 from ..exchange import Request, Turn
-from .dialects import Block
+from ..registers import Block
 from .registers import read_answer, read_request, write_answer
 
 

@@ -19,13 +19,14 @@ from ..errors import (
 from ..exchange import Turn
 from ..model import ChargerConfig, Fault, Orders, Setting
 from ..protocol import Progress
+from ..registers import Block
 from ..scan import FoundCharger, ScanResult
 from .balancing import SLAVES
-from .dialects import MAPS, Block, Dialect
+from .dialects import MAPS, Dialect, Status
 from .exchanges import read
 from .probing import Probe
 from .readings import charger_info
-from .registers import Status, decode_configuration, decode_status
+from .registers import decode_configuration, decode_status
 
 ASKED: Final = 3
 """How often a unit is asked that stays silent: right after it was switched on, or in
@@ -86,7 +87,7 @@ async def _look_at(bus: Bus, unit: int) -> tuple[FoundCharger, Dialect]:
         except ExchangeRefusedError as error:
             probe.refused(error.code)
     dialect = probe.found
-    status = decode_status(dialect, await _read(bus, unit, MAPS[dialect].status))
+    status = decode_status(dialect, await _read(bus, unit, MAPS[dialect].status.block))
     info = charger_info(dialect, status.serial)
     charger = FoundCharger(
         address=unit,

@@ -22,13 +22,14 @@ from ..model import (
     Range,
     Setting,
 )
+from ..registers import Block
 from ..safety import Setpoint, clamp
 from .balancing import RequestKind
 from .box import SmartEvseBox
 from .config import SlaveConfig
-from .dialects import Block, Dialect
+from .dialects import Dialect, Status
 from .master import Master
-from .registers import Status, read_answer, read_request, tenths
+from .registers import read_answer, read_request, tenths
 from .sharing import LOWEST, Claim
 from .states import CHARGING, UNPLUGGED
 

@@ -12,7 +12,8 @@ In brackets: not asked for. PROTOCOLS.md, 3.
 """
 
 from ..errors import ImplausibleReplyError
-from .dialects import MAPS, PROBE_A0, PROBE_A9, Block, Dialect
+from ..registers import Block
+from .dialects import MAPS, PROBE_A0, PROBE_A9, Dialect
 from .registers import ILLEGAL_ADDRESS, decode_status, dialect_of_a0
 
 
@@ -46,7 +47,7 @@ class Probe:
         """Take an exception; raises ImplausibleReplyError for no SmartEVSE's."""
         if self.ask != PROBE_A0 or code != ILLEGAL_ADDRESS:
             raise _unknown(self.ask)
-        self.ask = MAPS[Dialect.LATER].status
+        self.ask = MAPS[Dialect.LATER].status.block
 
 
 def _unknown(block: Block) -> ImplausibleReplyError:

@@ -25,8 +25,9 @@ from ..model import (
     Orders,
     Setting,
 )
+from ..registers import Block
 from .config import SmartEvseConfig
-from .dialects import MAPS, PROBE_A0, Block, Dialect
+from .dialects import MAPS, PROBE_A0, Dialect, Status
 from .exchanges import read
 from .probing import Probe
 from .readings import capabilities_of, charger_info, charger_reading
@@ -34,7 +35,6 @@ from .registers import (
     ILLEGAL_ADDRESS,
     LONGEST_REQUEST,
     Configuration,
-    Status,
     decode_configuration,
     decode_status,
 )
@@ -204,7 +204,9 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
         """
         dialect = self.known_dialect
         try:
-            status = decode_status(dialect, await self.read(turn, MAPS[dialect].status))
+            status = decode_status(
+                dialect, await self.read(turn, MAPS[dialect].status.block)
+            )
         except ExchangeRefusedError as error:
             if error.code == ILLEGAL_ADDRESS:
                 # Its firmware is another one than a moment ago.

@@ -4,8 +4,8 @@ from typing import Final
 
 from ..model import Capability, Setting, Status as Word
 from ..readings import ChargerInfo, ChargerReading, ConnectorReading
-from .dialects import MAPS, Dialect
-from .registers import Configuration, Status
+from .dialects import MAPS, Dialect, Status
+from .registers import Configuration
 from .states import UNPLUGGED, offered, state_of, tells_plug, word_of
 
 _CAPABILITIES: Final = frozenset(
@@ -30,7 +30,7 @@ _FIRMWARE: Final = {
 
 def capabilities_of(dialect: Dialect | None) -> frozenset[Capability]:
     """Return what a box of a dialect has; ``None``: not known yet."""
-    if dialect is not None and MAPS[dialect].temperature is not None:
+    if dialect is not None and "temperature" in MAPS[dialect].status.words:
         return _CAPABILITIES | {Capability.TEMPERATURE}
     return _CAPABILITIES
 

@@ -22,11 +22,11 @@ from ..exchange import Turn
 from ..model import ChargerConfig, Orders, Setting
 from ..protocol import Progress
 from ..scan import FoundCharger, ScanResult
-from .dialects import MAPS, Dialect
+from .dialects import MAPS, Dialect, Status
 from .exchanges import read
 from .probing import Probe
 from .readings import charger_info
-from .registers import Status, decode_configuration, decode_status
+from .registers import decode_configuration, decode_status
 
 UNITS: Final = (1, 0)
 """The more common one first."""
@@ -91,7 +91,7 @@ async def _ask(unit: int, turn: Turn) -> FoundCharger:
         except ExchangeRefusedError as error:
             probe.refused(error.code)
     dialect = probe.found
-    status = decode_status(dialect, await read(turn, unit, MAPS[dialect].status))
+    status = decode_status(dialect, await read(turn, unit, MAPS[dialect].status.block))
     info = charger_info(dialect, status.serial)
     return FoundCharger(
         address=unit,

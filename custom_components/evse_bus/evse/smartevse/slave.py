@@ -20,9 +20,9 @@ from ..model import Fault, OrderChange, Orders, Persistence
 from ..schedule import Kind
 from .answers import ANSWER_BYTES, ANSWER_WITHIN, Answer
 from .balancing import RequestKind, SlaveRequest, acknowledge, decode_request
-from .dialects import Dialect
+from .dialects import Dialect, Status
 from .member import Member
-from .registers import Status, tenths
+from .registers import tenths
 from .states import is_stopped
 from .timing import LOOK_AGAIN
 

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from ..model import MAXIMUM_CURRENT, MINIMUM_CURRENT, Fault, Status as Word
-from .dialects import Dialect
-from .registers import Status
+from .dialects import Dialect, Status
 
 UNPLUGGED: Final = "A"
 CHARGING: Final = frozenset({"C", "D"})
