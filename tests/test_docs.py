@@ -13,7 +13,6 @@ from custom_components.evse_bus import (
     binary_sensor,
     button,
     event,
-    sensor_counts,
     sensor_tables,
     switch,
 )
@@ -130,8 +129,8 @@ def ews_entities() -> set[str]:
         "sensor": (
             *sensor_tables.CONNECTOR_SENSORS,
             *sensor_tables.CHARGER_SENSORS,
-            *sensor_counts.LISTENER_SENSORS,
-            sensor_counts.CONNECTED_BOXES,
+            *sensor_tables.LISTENER_SENSORS,
+            sensor_tables.CONNECTED_BOXES,
             sensor_tables.FAULT,
         ),
         "switch": (*switch.COMMANDS, *switch.CONNECTOR_COMMANDS, switch.ALLOWED),

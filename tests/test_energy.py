@@ -19,8 +19,8 @@ meters = st.floats(0, 1e9)
 @given(meters, meters)
 def test_the_first_meter_is_shown_as_it_is(first: float, rise: float) -> None:
     total = MeterTotal()
-    assert total.take(first, 0) == first
-    assert total.take(first + rise, 0) == first + rise
+    assert total.update(first, 0) == first
+    assert total.update(first + rise, 0) == first + rise
 
 
 @given(meters, st.lists(st.tuples(meters, st.integers(0, 3)), min_size=1))
@@ -28,10 +28,10 @@ def test_another_meter_never_makes_a_step(
     first: float, readings: list[tuple[float, int]]
 ) -> None:
     total = MeterTotal()
-    shown = total.take(first, 0)
+    shown = total.update(first, 0)
     before, generation = first, 0
     for meter, now in readings:
-        previous, shown = shown, total.take(meter, now)
+        previous, shown = shown, total.update(meter, now)
         expected = max(meter - before, 0.0) if now == generation else 0.0
         assert abs(shown - previous - expected) <= 1e-6 * (1 + abs(meter) + shown)
         before, generation = meter, now
@@ -42,7 +42,7 @@ def test_after_a_restart_only_what_can_have_flowed(
     kept: float, meter: float, away: float
 ) -> None:
     total = MeterTotal(total=kept)
-    shown = total.take(meter, 0, away)
+    shown = total.update(meter, 0, away)
     assert 0 <= shown - kept <= HIGHEST_POWER * away / 3600 + 1 + 1e-6 * kept
     if 0 <= meter - kept <= HIGHEST_POWER * away / 3600:
         assert shown == meter
@@ -50,10 +50,10 @@ def test_after_a_restart_only_what_can_have_flowed(
 
 def test_a_sum_goes_on_when_its_source_begins_anew() -> None:
     total = SummedTotal(total=100.0)
-    assert total.take(5.0, "one") == 105.0
-    assert total.take(7.0, "one") == 107.0
-    assert total.take(2.0, "two") == 109.0
-    assert total.take(1.0, "two") == 110.0
+    assert total.update(5.0, "one") == 105.0
+    assert total.update(7.0, "one") == 107.0
+    assert total.update(2.0, "two") == 109.0
+    assert total.update(1.0, "two") == 110.0
 
 
 async def test_estimated_energy_goes_on_after_a_restart(hass: HomeAssistant) -> None:

@@ -13,7 +13,7 @@ from syrupy.assertion import SnapshotAssertion
 
 from custom_components.evse_bus.const import DOMAIN
 from custom_components.evse_bus.evse.protocols import PROTOCOLS
-from custom_components.evse_bus.sensor_counts import BUS_SENSORS, CHARGER_STATISTICS
+from custom_components.evse_bus.sensor_tables import BUS_SENSORS, CHARGER_STATISTICS
 from tests.common import call, get_entity, running, wait_for_state, wait_until
 from tests.entity_table import VARYING, device_table, entity_table
 from tests.ews import listening

@@ -213,7 +213,7 @@ def test_what_passes_here_passes_the_library(data: st.DataObject) -> None:
         raw[12] = 2
     told = block.block.decode(bytes(raw))
     change = changes(told)
-    assert change.keys() == {parameter.within}
+    assert change.keys() == {parameter.field}
     secrets = dict.fromkeys(block.block.secrets, "")
     try:
         block.block.change(bytes(raw), secrets | change)

@@ -12,7 +12,6 @@ from custom_components.evse_bus import (
     event as events,
     number,
     select as selects,
-    sensor_counts,
     sensor_tables,
     switch as switches,
 )
@@ -58,11 +57,11 @@ DESCRIPTIONS = {
     ],
     "select": [selects.MODE, selects.MODE_AT_START],
     "sensor": [
-        *sensor_counts.BUS_SENSORS,
-        *sensor_counts.LISTENER_SENSORS,
-        sensor_counts.CONNECTED_BOXES,
+        *sensor_tables.BUS_SENSORS,
+        *sensor_tables.LISTENER_SENSORS,
+        sensor_tables.CONNECTED_BOXES,
         *sensor_tables.CHARGER_SENSORS,
-        *sensor_counts.CHARGER_STATISTICS,
+        *sensor_tables.CHARGER_STATISTICS,
         *sensor_tables.CONNECTOR_SENSORS,
         sensor_tables.ENERGY,
         sensor_tables.ESTIMATED_ENERGY,

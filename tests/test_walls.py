@@ -117,10 +117,21 @@ def test_pure_parts_of_a_protocol_do_not_talk() -> None:
                 assert not used & talking, path
 
 
-def test_the_coordinator_does_not_know_the_entities() -> None:
-    platforms = {"sensor", "number", "switch", "binary_sensor", "button", "entity"}
-    for name in ("coordinator", "orders", "configuration", "const"):
-        assert not local(INTEGRATION / f"{name}.py", INTEGRATION) & platforms
+def test_the_coordinator_does_not_know_what_stands_on_it() -> None:
+    above = {
+        *("binary_sensor", "button", "event", "number", "select", "sensor", "switch"),
+        *("entity", "diagnostics", "services", "actions", "config_flow", "flows"),
+    }
+    for name in (
+        *("coordinator", "connections", "devices", "discovery", "issues"),
+        *("managed_charger", "supply", "orders", "configuration", "errors", "const"),
+    ):
+        used = local(INTEGRATION / f"{name}.py", INTEGRATION)
+        assert not {one.split(".")[0] for one in used} & above, name
+
+
+def test_the_folder_of_the_integration_can_be_taken_in_at_a_glance() -> None:
+    assert sum(path.is_file() for path in INTEGRATION.iterdir()) <= 30
 
 
 def test_virtual_chargers_share_nothing_with_the_library() -> None:

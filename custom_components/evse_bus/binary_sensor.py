@@ -1,4 +1,4 @@
-"""Binary sensors: plugged, charging, problem, and whether the port is open."""
+"""Binary sensors: connector states, problems, and connections."""
 
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ PARALLEL_UPDATES = 0
 
 @dataclass(frozen=True, kw_only=True)
 class ConnectorBinarySensorDescription(BinarySensorEntityDescription):
-    """Something a charger says of one connector."""
+    """Description of a binary state of one connector."""
 
     capability: Capability
     value: Callable[[ConnectorReading], bool | None]
@@ -41,14 +41,14 @@ class ConnectorBinarySensorDescription(BinarySensorEntityDescription):
 
 @dataclass(frozen=True, kw_only=True)
 class BoxBinarySensorDescription(BinarySensorEntityDescription):
-    """Something a box says of itself as a whole."""
+    """Description of a binary state of a whole box."""
 
     capability: Capability
     value: Callable[[ChargerReading], bool | None]
-    whole: bool = True
+    of_box: bool = True
 
 
-def _not(value: bool | None) -> bool | None:  # noqa: FBT001 - told, or not
+def _not(value: bool | None) -> bool | None:  # noqa: FBT001 - the value itself
     return None if value is None else not value
 
 
@@ -75,7 +75,7 @@ CONNECTOR_SENSORS: Final[tuple[ConnectorBinarySensorDescription, ...]] = (
     ConnectorBinarySensorDescription(
         key="locked",
         translation_key="locked",
-        # Home Assistant's class is on when something is unlocked.
+        # This device class is on when unlocked.
         device_class=BinarySensorDeviceClass.LOCK,
         entity_category=EntityCategory.DIAGNOSTIC,
         capability=Capability.LOCK,
@@ -154,8 +154,8 @@ async def async_setup_entry(
     coordinator = entry.runtime_data
     if coordinator.bus is not None:
         async_add_entities([ConnectedSensor(coordinator, coordinator.bus)])
-    if (duty := coordinator.connections.master) is not None:
-        async_add_entities([SecondMasterSensor(coordinator, duty)])
+    if (master := coordinator.connections.master) is not None:
+        async_add_entities([SecondMasterSensor(coordinator, master)])
     add_charger_entities(
         Platform.BINARY_SENSOR, entry, async_add_entities, _sensors, _obsolete
     )
@@ -178,46 +178,46 @@ def _sensors(
 
 
 def _obsolete(managed: ManagedCharger) -> Iterable[str]:
-    expire = managed.charger.config.order_lifetime is not None
-    return () if expire else (ORDERS_EXPIRED.key,)
+    orders_expire = managed.charger.config.order_lifetime is not None
+    return () if orders_expire else (ORDERS_EXPIRED.key,)
 
 
 class ConnectedSensor(BusEntity, BinarySensorEntity):
-    """Whether the port is open."""
+    """Connectivity of the port."""
 
     def __init__(self, coordinator: BusCoordinator, bus: Bus) -> None:
-        """Belong to the bus."""
+        """Initialize the binary sensor."""
         super().__init__(coordinator, CONNECTED)
         self._bus = bus
 
     @override
     def update_attributes(self) -> Hashable:
-        """Show whether bytes can go out."""
+        """Show whether the port is open."""
         self._attr_is_on = self._bus.connected
         return self._attr_is_on
 
 
 class BoxConnectedSensor(ChargerEntity, BinarySensorEntity):
-    """Whether a box that dials us is connected."""
+    """Connectivity of a box that dials."""
 
     def __init__(self, coordinator: BusCoordinator, managed: ManagedCharger) -> None:
-        """Belong to the box."""
-        super().__init__(coordinator, managed, CONNECTED, whole=True)
+        """Initialize the binary sensor."""
+        super().__init__(coordinator, managed, CONNECTED, of_box=True)
 
     @override
     def is_available(self) -> bool:
-        """Return true: a box that is gone is just what this tells."""
+        """Return true: this entity reports a missing box."""
         return True
 
     @override
     def update_attributes(self) -> Hashable:
-        """Show whether it is connected."""
+        """Show whether the box is connected."""
         self._attr_is_on = self.managed.bus.connected
         return self._attr_is_on
 
 
 class BoxBinarySensor(ChargerEntity, BinarySensorEntity):
-    """Something a box says of itself as a whole."""
+    """A binary state of a whole box."""
 
     def __init__(
         self,
@@ -225,42 +225,42 @@ class BoxBinarySensor(ChargerEntity, BinarySensorEntity):
         managed: ManagedCharger,
         description: BoxBinarySensorDescription,
     ) -> None:
-        """Belong to the box."""
-        super().__init__(coordinator, managed, description, whole=description.whole)
+        """Initialize the binary sensor."""
+        super().__init__(coordinator, managed, description, of_box=description.of_box)
         self._value = description.value
 
     @override
     def update_attributes(self) -> Hashable:
-        """Show what the box said."""
+        """Show the state last read."""
         reading = self.charger.reading
         self._attr_is_on = None if reading is None else self._value(reading)
         return self._attr_is_on
 
 
 class SecondMasterSensor(BusEntity, BinarySensorEntity):
-    """Whether somebody else also plays the master, so that we keep silent."""
+    """Problem: another master is on the bus, so ours is silent."""
 
-    def __init__(self, coordinator: BusCoordinator, duty: BusMaster) -> None:
-        """Belong to the bus."""
+    def __init__(self, coordinator: BusCoordinator, master: BusMaster) -> None:
+        """Initialize the binary sensor."""
         super().__init__(coordinator, SECOND_MASTER)
-        self._duty = duty
+        self._master = master
 
     @override
     def update_attributes(self) -> Hashable:
-        """Show what was noticed."""
-        self._attr_is_on = Fault.SECOND_MASTER in self._duty.noticed
+        """Show whether another master was detected."""
+        self._attr_is_on = Fault.SECOND_MASTER in self._master.noticed
         return self._attr_is_on
 
 
 class ProblemSensor(ChargerEntity, BinarySensorEntity):
-    """Whether there is any fault, told by the charger or noticed by us.
+    """Problem: any fault, reported by the charger or detected by us.
 
-    A box that waits for current or for the sun is not at fault.
+    Waiting for current or for the sun is not a fault.
     """
 
     @override
     def is_available(self) -> bool:
-        """Return whether there is anything to say; we notice some things ourselves."""
+        """Return whether it answers; a fault detected by us shows even if it does not."""
         return self.charger.available or bool(self.charger.noticed)
 
     @override
@@ -271,17 +271,17 @@ class ProblemSensor(ChargerEntity, BinarySensorEntity):
 
 
 class OrdersExpiredSensor(ChargerEntity, BinarySensorEntity):
-    """Whether the fail-safe counts because nobody has renewed the orders."""
+    """State of the orders: expired ones are replaced by the fail-safe."""
 
     @override
     def update_attributes(self) -> Hashable:
-        """Show whether the orders' lifetime is over."""
+        """Show whether the orders have expired."""
         self._attr_is_on = self.charger.orders_expired
         return self._attr_is_on
 
 
 class ConnectorBinarySensor(ConnectorEntity, BinarySensorEntity):
-    """Something a charger says of one connector."""
+    """A binary state of one connector."""
 
     def __init__(
         self,
@@ -290,13 +290,13 @@ class ConnectorBinarySensor(ConnectorEntity, BinarySensorEntity):
         number: int,
         description: ConnectorBinarySensorDescription,
     ) -> None:
-        """Be told with the connector."""
+        """Initialize the binary sensor."""
         super().__init__(coordinator, managed, number, description)
         self._value = description.value
 
     @override
     def update_attributes(self) -> Hashable:
-        """Show what the charger said."""
+        """Show the state last read."""
         reading = self.reading
         value = None if reading is None else self._value(reading)
         self._attr_is_on = value

@@ -1,4 +1,4 @@
-"""Buttons: restart a charger, wake a car."""
+"""Buttons: commands without a state."""
 
 from collections.abc import Hashable, Iterable
 from dataclasses import dataclass
@@ -21,12 +21,12 @@ PARALLEL_UPDATES = 0
 
 @dataclass(frozen=True, kw_only=True)
 class CommandButtonDescription(ButtonEntityDescription):
-    """Something that a charger does when told."""
+    """Description of a command without a state."""
 
     capability: Capability
     command: Command
-    whole: bool = False
-    """Of the whole box, where that has several ports."""
+    of_box: bool = False
+    """One button for a box, however many ports it has."""
 
 
 BUTTONS: Final[tuple[CommandButtonDescription, ...]] = (
@@ -37,7 +37,7 @@ BUTTONS: Final[tuple[CommandButtonDescription, ...]] = (
         entity_category=EntityCategory.CONFIG,
         capability=Capability.RESET,
         command=Command.RESET,
-        whole=True,
+        of_box=True,
     ),
     CommandButtonDescription(
         key="wake",
@@ -77,7 +77,7 @@ def _buttons(
 
 
 class CommandButton(ChargerEntity, ButtonEntity):
-    """Something that a charger does when told."""
+    """A command to a charger."""
 
     def __init__(
         self,
@@ -85,17 +85,17 @@ class CommandButton(ChargerEntity, ButtonEntity):
         managed: ManagedCharger,
         description: CommandButtonDescription,
     ) -> None:
-        """Belong to the charger."""
-        super().__init__(coordinator, managed, description, whole=description.whole)
+        """Initialize the button."""
+        super().__init__(coordinator, managed, description, of_box=description.of_box)
         self._command = description.command
 
     @override
     def update_attributes(self) -> Hashable:
-        """Show nothing but that it is there."""
+        """Return nothing: a button has no state but its availability."""
         return None
 
     @override
     async def async_press(self) -> None:
-        """Tell the charger; return when it is known to have worked."""
+        """Send the command; return when the charger has confirmed it."""
         with translated_errors(self.managed.name, self.coordinator.port):
             await self.charger.command(self._command)

@@ -1,4 +1,4 @@
-"""Set up a bus: protocol, port, search, chargers; change its port later."""
+"""Config flow of a bus: protocol, port, search, chargers; reconfiguration."""
 
 from collections.abc import Mapping
 from typing import Any, Final, override
@@ -55,13 +55,13 @@ from .flows.subentry import ChargerSubentryFlow
 from .flows.supply import check_supply, supply_data, supply_form
 
 _INTERFACES: Final = {"ews": "RS-232"}
-"""What the adapter has to be, where it is not RS-485."""
+"""Interface of the adapter, where it is not RS-485."""
 _URL_EXAMPLES: Final = "`socket://192.0.2.5:4001`, `rfc2217://192.0.2.5:2217`"
-"""Not for translators: what is typed is the same everywhere."""
+"""Not translated: URLs are the same in every language."""
 
 
 class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
-    """Set up one bus."""
+    """Config flow for one bus."""
 
     VERSION = 1
     MINOR_VERSION = 1
@@ -70,7 +70,7 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
     step_after_error = "port"
 
     def __init__(self) -> None:
-        """Start with nothing chosen."""
+        """Start without a search."""
         super().__init__()
         self._searches: list[Imposed] = []
 
@@ -80,8 +80,8 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
     def async_get_supported_subentry_types(
         cls, config_entry: EvseBusConfigEntry
     ) -> dict[str, type[ConfigSubentryFlow]]:
-        """Return what can be added to a bus."""
-        # A box that is ignored is an entry, too: one without anything in it.
+        """Return the subentry types of a bus."""
+        # An ignored box is an entry, too, without data.
         if CONF_PROTOCOL not in config_entry.data:
             return {}
         return {SUBENTRY_CHARGER: ChargerSubentryFlow}
@@ -90,7 +90,7 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
     @callback
     @override
     def async_supports_options_flow(cls, config_entry: EvseBusConfigEntry) -> bool:
-        """Return whether it listens: only then there is something to restrict."""
+        """Return whether it is a listener: only that has options."""
         return CONF_PROTOCOL in config_entry.data and (
             protocol_of(config_entry.data).dials_in
         )
@@ -99,7 +99,7 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
     @callback
     @override
     def async_get_options_flow(config_entry: EvseBusConfigEntry) -> OptionsFlow:
-        """Return the dialogue about who may dial."""
+        """Return the options flow of a listener."""
         return ListenerOptionsFlow()
 
     # -- Protocol and port -------------------------------------------------------
@@ -108,7 +108,7 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
     async def async_step_user(
         self, user_input: dict[str, Any] | None = None
     ) -> ConfigFlowResult:
-        """Choose what chargers they are."""
+        """Choose the make of the chargers."""
         if user_input is not None:
             make = user_input[CONF_PROTOCOL]
             if make == "smartevse":
@@ -123,14 +123,14 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
         self,
         user_input: dict[str, Any] | None = None,  # noqa: ARG002 - a step's signature
     ) -> ConfigFlowResult:
-        """Choose what Home Assistant is to a SmartEVSE; say what happens without it."""
+        """Choose whether Home Assistant polls a SmartEVSE or is its master."""
         return self.async_show_menu(step_id="mode", menu_options=["polled", "master"])
 
     async def async_step_polled(
         self,
         user_input: dict[str, Any] | None = None,  # noqa: ARG002
     ) -> ConfigFlowResult:
-        """Poll one box."""
+        """Set up one polled SmartEVSE."""
         self.protocol = PROTOCOLS["smartevse"]
         return await self.async_step_port()
 
@@ -138,7 +138,7 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
         self,
         user_input: dict[str, Any] | None = None,  # noqa: ARG002
     ) -> ConfigFlowResult:
-        """Be the load-balancing master of several boxes."""
+        """Set up the load-balancing master of several SmartEVSEs."""
         self.protocol = PROTOCOLS["smartevse_master"]
         return await self.async_step_port()
 
@@ -155,14 +155,14 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
         self,
         user_input: dict[str, Any] | None = None,  # noqa: ARG002
     ) -> ConfigFlowResult:
-        """Speak to one box over RS-232."""
+        """Set up one EWS-Box on RS-232."""
         self.protocol = PROTOCOLS["ews"]
         return await self.async_step_port()
 
     async def async_step_port(
         self, user_input: dict[str, Any] | None = None
     ) -> ConfigFlowResult:
-        """Choose the port; open it once, and send nothing."""
+        """Choose the port, and try to open it; nothing is sent."""
         errors = self.take_error()
         if user_input is not None:
             errors = await self._async_check_port(self.protocol, user_input)
@@ -189,9 +189,9 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
         typed: dict[str, Any],
         entry: EvseBusConfigEntry | None = None,
     ) -> Errors:
-        """Set `bus_data`, or return what is wrong; ``entry`` is being changed.
+        """Set `bus_data`, or return the errors.
 
-        Aborts when another bus has the port.
+        ``entry`` is the one being reconfigured. Aborts if another bus uses the port.
         """
         try:
             self.bus_data = bus_data(protocol, typed)
@@ -210,24 +210,24 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
             if other is not entry:
                 raise AbortFlow("already_configured")
             if entry.state is ConfigEntryState.LOADED:
-                # We have it open ourselves: it exists and is ours to use.
+                # This entry has the port open, so it exists and is not busy.
                 return {}
         error = await async_try_port(device, line_settings(self.bus_data))
         return {"base": error} if error else {}
 
-    # -- What all chargers share, where Home Assistant is their master -----------
+    # -- Shared supply, where Home Assistant is the master -----------------------
 
     async def async_step_supply(
         self, user_input: dict[str, Any] | None = None
     ) -> ConfigFlowResult:
-        """Ask what all chargers may draw together."""
+        """Ask for the limit of all chargers together."""
         errors: Errors = {}
         if user_input is not None:
             errors = check_supply(user_input)
             if not errors:
                 supply = supply_data(user_input)
                 self.bus_data |= supply
-                # No single one gets more than all of them share.
+                # No charger gets more than the shared limit.
                 limit = min(SUGGESTED_LIMIT, supply[CONF_SUPPLY_LIMIT])
                 self.suggestions |= supply | {CONF_INSTALLATION_LIMIT: limit}
                 return await self.async_step_scan()
@@ -240,13 +240,13 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
             description_placeholders=self.placeholders(),
         )
 
-    # -- Values to impose, where a search sets limits ----------------------------
+    # -- Limits to set, where a search needs them --------------------------------
 
     async def async_step_impose(
         self,
         user_input: dict[str, Any] | None = None,  # noqa: ARG002 - a step's signature
     ) -> ConfigFlowResult:
-        """Say that a search sets limits, and choose how to search."""
+        """Warn that a search sets limits, and choose how to search."""
         return self.async_show_menu(
             step_id="impose",
             menu_options=["search_single", "search_addresses", "manual"],
@@ -256,13 +256,13 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
     async def async_step_search_single(
         self, user_input: dict[str, Any] | None = None
     ) -> ConfigFlowResult:
-        """Ask what to set on the one box of a point-to-point line."""
+        """Ask for the limits of the one box on a point-to-point line."""
         return await self._async_impose("search_single", user_input)
 
     async def async_step_search_addresses(
         self, user_input: dict[str, Any] | None = None
     ) -> ConfigFlowResult:
-        """Ask which boxes to look for, and what to set on them."""
+        """Ask for the addresses to search, and for the limits of these boxes."""
         return await self._async_impose("search_addresses", user_input)
 
     async def _async_impose(
@@ -305,13 +305,13 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
 
     @override
     def choices(self) -> tuple[str, ...]:
-        """Return where one can go when a search brought nothing to add."""
+        """Return the steps to offer when a search has found nothing to add."""
         other_values = ("impose",) if self.protocol.probe_sets_limits else ()
         return ("scan", *other_values, "manual", "port")
 
     @override
     async def async_scan(self, progress: Progress) -> ScanResult:
-        """Open the port for a search, and close it again whatever happens."""
+        """Open the port for a search, and close it again in any case."""
         bus = self.protocol.bus(
             self.bus_data[CONF_DEVICE], settings=line_settings(self.bus_data)
         )
@@ -323,16 +323,16 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
 
     @override
     def finish(self, chargers: list[ConfigSubentryData]) -> ConfigFlowResult:
-        """Create the bus with its chargers."""
+        """Create the config entry of the bus, with its chargers."""
         if self._listener is not None:
             return self.add_box(chargers)
-        # Another dialogue may have been quicker.
+        # Another flow may have added the bus in the meantime.
         self._async_abort_entries_match({CONF_DEVICE: self.bus_data[CONF_DEVICE]})
         return self.async_create_entry(
             title=_title(self.bus_data), data=self.bus_data, subentries=chargers
         )
 
-    # -- FollowUp -------------------------------------------------------------------
+    # -- Reconfiguration ---------------------------------------------------------
 
     async def async_step_reconfigure(
         self, user_input: dict[str, Any] | None = None
@@ -348,10 +348,10 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
             errors |= await self._async_check_port(protocol, user_input, entry)
             if not errors:
                 self.bus_data |= supply_data(user_input)
-                # Who gave the bus a name of their own keeps it.
-                own = entry.title != _title(entry.data)
-                title = entry.title if own else _title(self.bus_data)
-                # A loaded bus listens for changes and reloads by itself.
+                # A title set by the user stays.
+                is_own = entry.title != _title(entry.data)
+                title = entry.title if is_own else _title(self.bus_data)
+                # The update listener of a loaded entry reloads it.
                 update = (
                     self.async_update_and_abort
                     if entry.update_listeners
@@ -381,5 +381,5 @@ def _port_placeholders(protocol: Protocol) -> dict[str, str]:
 
 
 def _title(data: Mapping[str, Any]) -> str:
-    """Return a bus's name, as long as nobody gave it another."""
+    """Return the default title of a bus."""
     return f"{short_name(protocol_of(data))} bus ({port_name(data[CONF_DEVICE])})"

@@ -287,7 +287,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
                 self._notify((managed.key, number))
 
     def _update_structure(self, managed: ManagedCharger) -> None:
-        """Add the devices and entities of what has become known of a charger."""
+        """Add the devices and entities for newly found capabilities and connectors."""
         managed.connector_numbers |= managed.connectors.keys()
         charger = managed.charger
         structure = (

@@ -116,20 +116,20 @@ def _bus(
 
 def _master(coordinator: BusCoordinator) -> dict[str, Any] | None:
     """Return the state of the bus master; ``None``: the protocol has none."""
-    duty = coordinator.connections.master
-    if duty is None:
+    master = coordinator.connections.master
+    if master is None:
         return None
     data = {
-        "silent": duty.silent,
-        "noticed": plain(duty.noticed),
+        "silent": master.silent,
+        "noticed": plain(master.noticed),
         "order": plain(coordinator.orders.supply),
-        "statistics": plain(duty.statistics),
+        "statistics": plain(master.statistics),
     }
-    if isinstance(duty, Master):
-        data["supply"] = plain(duty.supply)
+    if isinstance(master, Master):
+        data["supply"] = plain(master.supply)
         # In tenths of an ampere, by Modbus address.
         data["shares"] = {
-            str(address): share / 10 for address, share in duty.shares().items()
+            str(address): share / 10 for address, share in master.shares().items()
         }
     return data
 

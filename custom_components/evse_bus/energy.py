@@ -1,15 +1,15 @@
-"""Energy totals that only grow by what has really flowed. Pure.
+"""Energy totals that grow only by measured consumption. Pure.
 
-The recorder takes every rise of a total as consumption. A meter's own value may
-rise for other reasons: another module has moved behind a number, a box was
-exchanged. Then the total goes on from where it was, with the new meter.
+The recorder counts every rise of a total as consumption. The value of a meter may
+jump for other reasons: a box was exchanged, or another module took its address. Then
+the total continues from its old value, with the new meter.
 """
 
 from dataclasses import dataclass
 from typing import Final
 
 HIGHEST_POWER: Final = 3 * 80.0 * 250.0
-"""What no connector can exceed, W: three phases, IEC 61851's 80 A, 250 V."""
+"""Upper bound for any connector, W: three phases, 80 A (IEC 61851-1), 250 V."""
 
 
 @dataclass(slots=True)
@@ -17,48 +17,50 @@ class MeterTotal:
     """The total of a charger's own meter."""
 
     offset: float = 0.0
-    """What is added to the meter, Wh."""
+    """Added to the value of the meter, Wh."""
     total: float | None = None
-    """Wh; as long as the first meter stays, this is what it shows."""
+    """Wh; equal to the value of the first meter as long as that stays."""
     generation: int | None = None
-    """Of the meter last seen; ``None``: not seen since the start."""
+    """Generation of the last meter; ``None``: none read since the start."""
 
-    def take(self, meter: float, generation: int, away: float = 0.0) -> float:
-        """Return the total for a meter's value, Wh.
+    def update(self, meter: float, generation: int, downtime: float = 0.0) -> float:
+        """Return the total for a value of the meter, both in Wh.
 
-        ``away``: how long ago the total before a restart was kept, s.
+        ``downtime``: time since the total was stored before a restart, s.
         """
         now = self.offset + meter
-        if self.total is not None and not self._goes_on(now, generation, away):
+        if self.total is not None and not self._is_same_meter(
+            now, generation, downtime
+        ):
             self.offset = self.total - meter
             now = self.total
         self.generation = generation
         self.total = now
         return now
 
-    def _goes_on(self, now: float, generation: int, away: float) -> bool:
+    def _is_same_meter(self, now: float, generation: int, downtime: float) -> bool:
         """Return whether this can be the same meter as before."""
         if self.total is None:
             return True
         if self.generation is not None:
             return generation == self.generation and now >= self.total
-        # After a restart nobody knows; what cannot have flowed was not this meter.
-        return 0 <= now - self.total <= HIGHEST_POWER * away / 3600 + 1
+        # After a restart the generation is unknown: judge by the possible energy.
+        return 0 <= now - self.total <= HIGHEST_POWER * downtime / 3600 + 1
 
 
 @dataclass(slots=True)
 class SummedTotal:
-    """The total of an energy that the library sums from its start on."""
+    """The total of an energy that the library sums up from its start on."""
 
     total: float = 0.0
     """Wh"""
     counted: float = 0.0
-    """What the library had summed when we looked last, Wh."""
+    """Sum of the library at the last update, Wh."""
     source: object = None
-    """Who sums; another one begins at 0."""
+    """Object that sums up; another one starts at 0."""
 
-    def take(self, summed: float, source: object) -> float:
-        """Return the total, Wh."""
+    def update(self, summed: float, source: object) -> float:
+        """Return the total for a sum of the library, both in Wh."""
         if source is not self.source or summed < self.counted:
             self.source = source
             self.counted = 0.0

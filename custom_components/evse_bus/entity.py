@@ -40,14 +40,14 @@ def supported[D: CapabilityDescription](
 ) -> Iterable[D]:
     """Return the descriptions from a table that apply to a charger.
 
-    A description of a whole box (``whole``) applies to its primary port only.
+    A description of a whole box (``of_box``) applies to its primary port only.
     """
     capabilities = managed.charger.capabilities
     return (
         description
         for description in descriptions
         if (description.capability is None or description.capability in capabilities)
-        and (managed.is_primary_port or not getattr(description, "whole", False))
+        and (managed.is_primary_port or not getattr(description, "of_box", False))
     )
 
 
@@ -175,18 +175,18 @@ class ChargerEntity(EvseBusEntity):
         description: EntityDescription,
         context: Context | None = None,
         *,
-        whole: bool = False,
+        of_box: bool = False,
     ) -> None:
-        """Attach the entity to the charger's device; ``whole``: to that of its box."""
+        """Attach the entity to the charger's device; ``of_box``: to that of its box."""
         super().__init__(coordinator, context or (managed.key, None), description)
         self.managed = managed
-        owner = managed.subentry_id if whole else managed.key
+        owner = managed.subentry_id if of_box else managed.key
         self._attr_unique_id = f"{owner}_{description.key}"
         self._attr_device_info = (
             connector_info(managed, managed.port_number)
             if managed.port_number is not None
             and managed.has_child_devices
-            and not whole
+            and not of_box
             else charger_info(managed)
         )
 

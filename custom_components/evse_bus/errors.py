@@ -1,4 +1,4 @@
-"""What went wrong, in the user's words: library errors as Home Assistant's."""
+"""Errors of the library as translated errors of Home Assistant."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -36,7 +36,7 @@ from .evse.errors import (
 from .evse.ews.answers import EwsRefusedError, Refusal
 from .evse.ews.parameters import HiddenSecretError
 
-# The first class that fits counts, so the special stand before the general.
+# The first class that matches counts, so subclasses come before their base.
 _PORT_KEYS: Final[tuple[tuple[type[LineError], str], ...]] = (
     (PortMissingError, "port_missing"),
     (PortBusyError, "port_busy"),
@@ -71,11 +71,11 @@ _COMMAND_KEYS: Final[tuple[tuple[type[EvseError], str], ...]] = (
 )
 
 EWS_KEYS: Final[Mapping[Refusal, str]] = {reason: f"ews_{reason}" for reason in Refusal}
-"""An EWS-Box says why it refuses: each reason has a text that says what to do."""
+"""Translation keys of the reasons for which an EWS-Box refuses a command."""
 
 
 class ActionError(StrEnum):
-    """What is wrong with what an action was given, or with what came of it."""
+    """Translation keys of invalid action data and of failed actions."""
 
     NOT_EWS_BOX = "not_ews_box"
     CHOOSE_PORT = "choose_port"
@@ -102,7 +102,7 @@ class ActionError(StrEnum):
 
 
 def wrong_action(key: ActionError, **placeholders: object) -> ServiceValidationError:
-    """Return the error for an action that cannot be meant."""
+    """Return the error for invalid action data."""
     return ServiceValidationError(
         translation_domain=DOMAIN,
         translation_key=key.value,
@@ -126,9 +126,9 @@ def _as_texts(placeholders: Mapping[str, object]) -> dict[str, str]:
 def not_ready(
     error: LineError, port: str, *, listens: bool = False
 ) -> ConfigEntryNotReady:
-    """Return why a bus cannot be set up now; Home Assistant tries again later.
+    """Return the error for a port that cannot be opened; setup is retried later.
 
-    ``listens``: the port is one that boxes are to dial.
+    ``listens``: the port is that of a listener.
     """
     keys = _LISTEN_KEYS if listens else _PORT_KEYS
     return ConfigEntryNotReady(
@@ -140,10 +140,10 @@ def not_ready(
 
 @contextmanager
 def translated_errors(charger: str, port: str) -> Iterator[None]:
-    """Turn what a command raises into what Home Assistant shows.
+    """Translate the errors of a command.
 
-    Raises ServiceValidationError for a wish that cannot be meant and
-    HomeAssistantError for one that could not be carried out.
+    Raises ServiceValidationError for an invalid order and HomeAssistantError for one
+    that could not be carried out.
     """
     try:
         yield

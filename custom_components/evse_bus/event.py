@@ -1,4 +1,4 @@
-"""Events: keys, cards, starts that are asked for, charges that begin and end."""
+"""Events: keys, cards, requested starts, begin and end of a charge."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -29,22 +29,22 @@ from .managed_charger import ManagedCharger
 
 PARALLEL_UPDATES = 0
 
-type Told = tuple[str, Mapping[str, Any]]
-"""Type of an event, and what else is told of it."""
+type EventData = tuple[str, Mapping[str, Any]]
+"""Type and attributes of an event."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ChargerEventDescription(EventEntityDescription):
-    """Something that happens at a charger."""
+    """Description of the events of one kind."""
 
     capability: Capability
-    take: Callable[[Event], Told | None]
-    """Return what to tell of an event; ``None``: it is of another kind."""
-    whole: bool = False
+    convert: Callable[[Event], EventData | None]
+    """Return type and attributes of an event; ``None``: it is of another kind."""
+    of_box: bool = False
 
 
 def _key(number: int) -> ChargerEventDescription:
-    def take(event: Event) -> Told | None:
+    def convert(event: Event) -> EventData | None:
         if not isinstance(event, KeyEvent) or event.key != number:
             return None
         if event.held is None:
@@ -58,11 +58,11 @@ def _key(number: int) -> ChargerEventDescription:
         device_class=EventDeviceClass.BUTTON,
         event_types=[ButtonEventType.PRESS_START, ButtonEventType.PRESS_END],
         capability=Capability.KEYS,
-        take=take,
+        convert=convert,
     )
 
 
-def _charge(event: Event) -> Told | None:
+def _charge(event: Event) -> EventData | None:
     if isinstance(event, ChargeStarted):
         return "started", {}
     if isinstance(event, ChargeEnded):
@@ -75,23 +75,23 @@ def _charge(event: Event) -> Told | None:
     return None
 
 
-def _start_request(event: Event) -> Told | None:
+def _start_request(event: Event) -> EventData | None:
     if not isinstance(event, StartRequested):
         return None
-    told: dict[str, Any] = {"optimised": event.optimised}
+    attributes: dict[str, Any] = {"optimised": event.optimised}
     if event.group is not None:
-        told |= {"group": event.group, "number": event.number}
-    return "requested", told
+        attributes |= {"group": event.group, "number": event.number}
+    return "requested", attributes
 
 
-def _card(event: Event) -> Told | None:
+def _card(event: Event) -> EventData | None:
     if not isinstance(event, CardPresented):
         return None
-    # Whether the box calls it valid is not told: over Ethernet it always does.
-    told: dict[str, Any] = {"tag": event.tag.hex(), "readable": event.readable}
+    # Without the valid flag: over Ethernet the box always sets it.
+    attributes: dict[str, Any] = {"tag": event.tag.hex(), "readable": event.readable}
     if event.readable:
-        told |= {"group": event.group, "number": event.number}
-    return "presented", told
+        attributes |= {"group": event.group, "number": event.number}
+    return "presented", attributes
 
 
 EVENTS: Final[tuple[ChargerEventDescription, ...]] = (
@@ -101,22 +101,22 @@ EVENTS: Final[tuple[ChargerEventDescription, ...]] = (
         translation_key="charge",
         event_types=["started", "ended"],
         capability=Capability.START_REQUEST,
-        take=_charge,
+        convert=_charge,
     ),
     ChargerEventDescription(
         key="start_request",
         translation_key="start_request",
         event_types=["requested"],
         capability=Capability.START_REQUEST,
-        take=_start_request,
+        convert=_start_request,
     ),
     ChargerEventDescription(
         key="card",
         translation_key="card",
         event_types=["presented"],
         capability=Capability.CARDS,
-        take=_card,
-        whole=True,
+        convert=_card,
+        of_box=True,
     ),
 )
 
@@ -138,7 +138,7 @@ def _events(
 
 
 class ChargerEvent(ChargerEntity, EventEntity):
-    """Something that happens at a charger."""
+    """Events of one kind at a charger."""
 
     def __init__(
         self,
@@ -146,25 +146,25 @@ class ChargerEvent(ChargerEntity, EventEntity):
         managed: ManagedCharger,
         description: ChargerEventDescription,
     ) -> None:
-        """Belong to the port, or to the whole box."""
-        super().__init__(coordinator, managed, description, whole=description.whole)
-        self._take = description.take
+        """Initialize the event entity."""
+        super().__init__(coordinator, managed, description, of_box=description.of_box)
+        self._convert = description.convert
 
     @override
     async def async_added_to_hass(self) -> None:
-        """Listen."""
+        """Subscribe to the events of the charger."""
         await super().async_added_to_hass()
         self.async_on_remove(self.managed.events.subscribe(self._on_event))
 
     @callback
     def _on_event(self, event: Event) -> None:
-        """Tell an event of this kind."""
-        if (told := self._take(event)) is None:
+        """Trigger the entity if the event is of its kind."""
+        if (data := self._convert(event)) is None:
             return
-        event_type, attributes = told
+        event_type, attributes = data
         self._trigger_event(event_type, dict(attributes))
         self.async_write_ha_state()
 
     @override
     def update_attributes(self) -> None:
-        """Show nothing but that it is there: an event is told when it happens."""
+        """Return nothing: an event is triggered when it happens."""

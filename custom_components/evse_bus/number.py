@@ -1,7 +1,7 @@
-"""Numbers: limits, fail-safe values, the settings of a box, what a bus shares.
+"""Numbers: limits, fail-safe values, settings of a box, the shared supply.
 
-Limits show orders, never a reading: a slider that followed what the charger just
-offers would go down with it and not come up again.
+Limits show orders, never readings: a slider that followed the current on offer would
+go down with it and not come up again.
 """
 
 from collections.abc import Callable, Hashable, Iterable
@@ -46,18 +46,18 @@ from .supply import STEP, SharedSupply
 PARALLEL_UPDATES = 0
 
 LONGEST_TIMEOUT: Final = 3600
-"""Longest fail-safe time-out offered, s; a longer one would hardly be safe."""
+"""Longest fail-safe time-out on offer, s; a longer one would hardly be safe."""
 SHORTEST_STEP: Final = 0.1
-"""Finest step of a slider, A; what a protocol cannot say is rounded down."""
+"""Finest step of a slider, A; the protocol rounds down to its own resolution."""
 
 FAIL_SAFE_CURRENT: Final = "fail_safe_current"
 
 
 def ceiling(limits: Limits) -> float:
-    """Return the highest current that may be asked for, A.
+    """Return the highest current that can be ordered, A.
 
-    A maximum that the charger has not told yet does not count here: until it has,
-    6 A reach the wire whatever the order says.
+    A maximum that the charger has not reported yet is left out: until it has, 6 A is
+    sent, whatever the order.
     """
     if limits.reported is None:
         return limits.installation
@@ -66,7 +66,7 @@ def ceiling(limits: Limits) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class OrderNumberDescription(NumberEntityDescription):
-    """One number of a charger's orders."""
+    """Description of one number of a charger's orders."""
 
     exists: Callable[[Charger], bool] = lambda _charger: True
     value: Callable[[Orders, Limits], float]
@@ -89,7 +89,7 @@ def _one_phase(index: int, value: float) -> Phases[float | None]:
 
 
 def _limit_of(index: int, limit: CurrentLimit, limits: Limits) -> float:
-    """Return a phase's own limit; without one nothing but the ceiling limits it."""
+    """Return the limit of a phase; without one of its own, the ceiling."""
     own = limit.phases[index]
     return ceiling(limits) if own is None else min(own, ceiling(limits))
 
@@ -99,7 +99,7 @@ def _has(capability: Capability) -> Callable[[Charger], bool]:
 
 
 def falls_back(charger: Charger) -> bool:
-    """Return whether a fail-safe current counts: the box's or an order's lifetime's."""
+    """Return whether a fail-safe current applies: in the box, or to expired orders."""
     return (
         Capability.FAIL_SAFE_CURRENT in charger.capabilities
         or charger.config.order_lifetime is not None
@@ -144,8 +144,8 @@ NUMBERS: Final[tuple[OrderNumberDescription, ...]] = (
         translation_key="charging_current",
         value=lambda orders, limits: min(orders.limit.current, ceiling(limits)),
         change=lambda value: OrderChange(current=value),
-        # A box whose own minimum is above all that it may offer has no range; what is
-        # ordered is refused with the reason.
+        # The minimum of a box may be above its ceiling: then an order is refused, with
+        # the reason.
         lowest=lambda limits: min(limits.minimum, ceiling(limits)),
         **_CURRENT,
     ),
@@ -169,7 +169,7 @@ NUMBERS: Final[tuple[OrderNumberDescription, ...]] = (
         mode=NumberMode.BOX,
         exists=_has(Capability.FAIL_SAFE_TIMEOUT),
         value=lambda orders, _limits: orders.fail_safe_timeout,
-        # int() would raise something else for NaN.
+        # `number` raises RefusedOrderError for NaN, int() ValueError.
         change=lambda value: OrderChange(
             fail_safe_timeout=int(number(value, "fail-safe time-out"))
         ),
@@ -180,12 +180,12 @@ NUMBERS: Final[tuple[OrderNumberDescription, ...]] = (
 )
 
 
-# -- What a box keeps in its own memory ------------------------------------------
+# -- Settings of a box -----------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
 class SettingNumberDescription(NumberEntityDescription):
-    """A number that a box keeps in its own memory."""
+    """Description of a number that a box stores in its own memory."""
 
     setting: Setting
 
@@ -193,8 +193,8 @@ class SettingNumberDescription(NumberEntityDescription):
 def _setting(setting: Setting, **traits: Any) -> SettingNumberDescription:  # noqa: ANN401 - of many types
     """Return the description of a setting.
 
-    Disabled at first: the memory of a box bears a limited number of writes, and
-    what is set once is best not at hand for automations.
+    Disabled by default: the memory of a box endures a limited number of writes, so
+    automations should not use it.
     """
     key = f"setting_{setting}"
     return SettingNumberDescription(
@@ -229,11 +229,11 @@ SETTINGS: Final[tuple[SettingNumberDescription, ...]] = (
 )
 
 
-def whole(value: float) -> int:
-    """Return a setting as a box stores it: rounded down.
+def whole_number(value: float) -> int:
+    """Return the value of a setting rounded down, as a box stores it.
 
-    Raises RefusedOrderError for what is not finite: NaN passes Home Assistant's own
-    range check.
+    Raises RefusedOrderError unless it is finite: NaN passes Home Assistant's own range
+    check.
     """
     if not isfinite(value):
         message = f"not a finite number: {value!r}"
@@ -241,7 +241,7 @@ def whole(value: float) -> int:
     return floor(value)
 
 
-# -- What a bus shares -----------------------------------------------------------
+# -- Shared supply ---------------------------------------------------------------
 
 SUPPLY: Final = NumberEntityDescription(
     key="shared_supply", translation_key="shared_supply", native_min_value=0, **_CURRENT
@@ -270,8 +270,8 @@ def _numbers(
     order = partial(OrderNumber, coordinator, managed)
     yield from (order(entry) for entry in NUMBERS if entry.exists(managed.charger))
     setting = partial(SettingNumber, coordinator, managed)
-    there = managed.charger.settings
-    yield from (setting(entry) for entry in SETTINGS if entry.setting in there)
+    settings = managed.charger.settings
+    yield from (setting(entry) for entry in SETTINGS if entry.setting in settings)
 
 
 def _obsolete(managed: ManagedCharger) -> Iterable[str]:
@@ -287,13 +287,13 @@ class OrderNumber(ChargerEntity, NumberEntity):
         managed: ManagedCharger,
         description: OrderNumberDescription,
     ) -> None:
-        """Belong to the charger."""
+        """Initialize the number."""
         super().__init__(coordinator, managed, description)
         self._order = description
 
     @override
     def update_attributes(self) -> Hashable:
-        """Show the order that counts, and what may be asked for."""
+        """Show the order in effect, and its range."""
         order = self._order
         limits = self.charger.limits
         self._attr_native_value = order.value(self.charger.effective_orders, limits)
@@ -304,13 +304,13 @@ class OrderNumber(ChargerEntity, NumberEntity):
 
     @override
     async def async_set_native_value(self, value: float) -> None:
-        """Order a value; return when the charger follows it."""
+        """Change the order; return when the charger has confirmed it."""
         with translated_errors(self.managed.name, self.coordinator.port):
             await self.charger.change_orders(self._order.change(value))
 
 
 class SettingNumber(SettingEntity, NumberEntity):
-    """A number that a box keeps in its own memory."""
+    """A number that a box stores in its own memory."""
 
     def __init__(
         self,
@@ -318,45 +318,45 @@ class SettingNumber(SettingEntity, NumberEntity):
         managed: ManagedCharger,
         description: SettingNumberDescription,
     ) -> None:
-        """Belong to the charger."""
+        """Initialize the number."""
         super().__init__(coordinator, managed, description, description.setting)
 
     @override
     def update_attributes(self) -> Hashable:
-        """Show what the box told, and what can be set."""
-        reach = self.value_range
+        """Show the stored value, and its range."""
+        value_range = self.value_range
         self._attr_native_value = self.stored_value
-        self._attr_native_min_value = reach.minimum
-        self._attr_native_max_value = reach.maximum
-        return (self.stored_value, reach)
+        self._attr_native_min_value = value_range.minimum
+        self._attr_native_max_value = value_range.maximum
+        return (self.stored_value, value_range)
 
     @override
     async def async_set_native_value(self, value: float) -> None:
-        """Write it into the box; return when it is read back."""
+        """Write the value to the box; return when it is read back."""
         with translated_errors(self.managed.name, self.coordinator.port):
-            await self.charger.configure(self.setting, whole(value))
+            await self.charger.configure(self.setting, whole_number(value))
 
 
 class SupplyNumber(BusEntity, NumberEntity):
-    """What all chargers of a bus may draw together, A a phase."""
+    """Limit of all chargers of a bus together, A per phase."""
 
     _attr_native_step = STEP
 
     def __init__(self, coordinator: BusCoordinator, supply: SharedSupply) -> None:
-        """Belong to the bus."""
+        """Initialize the number."""
         super().__init__(coordinator, SUPPLY)
         self._supply = supply
 
     @override
     def update_attributes(self) -> Hashable:
-        """Show the order that counts, and what may be asked for."""
+        """Show the limit in effect, and its range."""
         self._attr_native_value = self._supply.limit
         self._attr_native_max_value = self._supply.installed.limit
         return (self._attr_native_value, self._attr_native_max_value)
 
     @override
     async def async_set_native_value(self, value: float) -> None:
-        """Order it; return when it counts."""
+        """Change the limit; return when it is in effect."""
         with translated_errors(
             self.coordinator.config_entry.title, self.coordinator.port
         ):

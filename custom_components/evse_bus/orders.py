@@ -1,9 +1,9 @@
-"""The orders of a bus and of its chargers on disk.
+"""Storage of the orders of a bus and of its chargers.
 
-Entity states are restored from minutes ago after a crash, and not at all for a
-disabled entity; a limit is a promise. So orders have a file of their own, one a
-bus. A lowering is on disk before it is sent; a raise is written soon after the
-charger has confirmed it, since losing one only means a lower limit.
+Restored entity states may be minutes old after a crash, and are missing for a disabled
+entity; a limit must be neither. So each bus has a file for its orders. A lowering is on
+disk before it is sent. A raise is written soon after the charger has confirmed it:
+losing one only means a lower limit.
 """
 
 import asyncio
@@ -24,7 +24,7 @@ from .evse.safety import cautious, number
 
 STORAGE_VERSION: Final = 1
 RAISE_DELAY: Final = 1.0
-"""How long a raise waits for others before it is written, s."""
+"""Delay before a raise is written, to combine several, s."""
 
 type _Stored = dict[str, dict[str, Any]]
 
@@ -61,7 +61,7 @@ def _retrieve_exception(task: asyncio.Task[Any]) -> None:
 
 
 class OrderStore:
-    """The stored orders of one config entry: of all chargers, and of the bus."""
+    """The stored orders of one config entry: of its chargers, and of its bus."""
 
     def __init__(
         self,
@@ -69,7 +69,7 @@ class OrderStore:
         entry_id: str,
         on_write: Callable[[Exception | None], None] = lambda _error: None,
     ) -> None:
-        """Read nothing yet; ``on_write`` is told how each write went."""
+        """Read nothing yet; ``on_write`` is called after each write, with its error."""
         self._hass = hass
         self._store = _WatchedStore(hass, entry_id, on_write)
         self._bus_key = entry_id
@@ -79,7 +79,7 @@ class OrderStore:
         self._writing = asyncio.Lock()
 
     async def async_load(self) -> None:
-        """Read the file; one that cannot be read counts as none."""
+        """Read the file; an unreadable one is treated as missing."""
         self._orders = {}
         self._supply = None
         try:
@@ -98,19 +98,19 @@ class OrderStore:
                 LOGGER.error("A stored order cannot be used: %s", error)
 
     def get(self, key: str) -> Orders | None:
-        """Return a charger's orders; ``None``: there are no usable ones."""
+        """Return a charger's orders; ``None``: none stored, or unreadable."""
         return self._orders.get(key)
 
     @property
     def supply(self) -> SupplyOrder | None:
-        """Return the order about what the bus shares; ``None``: no usable one."""
+        """Return the order for the shared supply; ``None``: none, or unreadable."""
         return self._supply
 
     async def async_commit(self, key: str, orders: Orders) -> None:
-        """Keep a charger's orders: a lowering is on disk when this returns.
+        """Store a charger's orders: a lowering is on disk when this returns.
 
-        Raises nothing when the disk refuses: the order is sent all the same, and
-        ``on_write`` knows.
+        A failed write raises nothing: the order is sent all the same, and ``on_write``
+        gets the error.
         """
         before = self._orders.get(key)
         if orders == before:
@@ -121,7 +121,7 @@ class OrderStore:
         )
 
     async def async_commit_supply(self, supply: SupplyOrder) -> None:
-        """Keep what the bus shares; otherwise as `async_commit`."""
+        """Store the order for the shared supply, in the same way as `async_commit`."""
         before = self._supply
         if supply == before:
             return
@@ -129,7 +129,7 @@ class OrderStore:
         await self._write(soon=before is not None and supply.raises(before))
 
     async def _write(self, *, soon: bool) -> None:
-        """Write now, or ``soon``: together with what comes next."""
+        """Write now; ``soon``: after a delay, together with further changes."""
         if not soon:
             await self.async_flush()
             return
@@ -137,15 +137,15 @@ class OrderStore:
         self._store.async_delay_save(self._encoded, RAISE_DELAY)
 
     async def async_keep_only(self, keys: Iterable[str]) -> None:
-        """Forget the orders of chargers that are no more."""
-        gone = self._orders.keys() - set(keys)
-        for key in gone:
+        """Delete the orders of all other chargers."""
+        obsolete = self._orders.keys() - set(keys)
+        for key in obsolete:
             del self._orders[key]
-        if gone:
+        if obsolete:
             await self.async_flush()
 
     async def async_flush(self) -> None:
-        """Write now what has not been written."""
+        """Write pending changes now."""
         self._pending = False
         await async_run_uncancelled(self._hass, self._async_save(), "evse_bus orders")
 
@@ -154,10 +154,10 @@ class OrderStore:
             await self._store.async_save(self._encoded())
 
     async def async_close(self) -> None:
-        """Leave nothing unwritten and no timer behind."""
+        """Write pending changes and wait for writes in progress."""
         if self._pending:
             await self.async_flush()
-        # Whoever reads the file next must not be quicker than what is being written.
+        # The file may be read again at once, after a reload.
         async with self._writing:
             pass
 
@@ -175,20 +175,20 @@ class OrderStore:
 
 @dataclass(frozen=True, slots=True)
 class SupplyOrder:
-    """What the chargers of a bus may draw together, as the user wants it to stand."""
+    """The user's order for the shared supply of a bus."""
 
     limit: float | None
-    """A a phase; ``None``: nobody has said so, all that the installation gives."""
+    """A per phase; ``None``: not set by the user, so the installation's limit."""
 
     def raises(self, before: SupplyOrder) -> bool:
-        """Return whether this allows more than another one."""
+        """Return whether this allows more than ``before``."""
         if self.limit is None or before.limit is None:
             return self.limit is None and before.limit is not None
         return self.limit > before.limit
 
 
 class _WatchedStore(Store[_Stored]):
-    """A store that tells whether a write worked; Store only logs that it did not."""
+    """A store that reports the result of each write; `Store` only logs errors."""
 
     def __init__(
         self,
@@ -217,7 +217,7 @@ class _WatchedStore(Store[_Stored]):
 
 
 def encode(orders: Orders) -> dict[str, Any]:
-    """Return orders as they are stored."""
+    """Return the stored form of orders."""
     return {
         "allowed": orders.allowed,
         "limit": _encode_limit(orders.limit),
@@ -227,10 +227,10 @@ def encode(orders: Orders) -> dict[str, Any]:
 
 
 def decode(record: Mapping[str, Any]) -> Orders:
-    """Return stored orders.
+    """Return orders from their stored form.
 
-    Raises RefusedOrderError for a number that is none, is not finite or is
-    negative, and TypeError or KeyError for a record of another shape.
+    Raises RefusedOrderError for a number that is negative, not finite or no number,
+    and TypeError or KeyError for a record of another shape.
     """
     allowed = record["allowed"]
     if not (allowed is None or isinstance(allowed, bool)):
@@ -245,7 +245,7 @@ def decode(record: Mapping[str, Any]) -> Orders:
 
 
 def decode_supply(record: Mapping[str, Any]) -> SupplyOrder:
-    """Return a stored order about the supply; raises as `decode` does."""
+    """Return an order for the supply from its stored form; raises as `decode` does."""
     stored = record["supply"]
     return SupplyOrder(None if stored is None else number(stored, "supply"))
 

@@ -31,7 +31,7 @@ def _word(serial: str) -> bytes:
 
 _SMARTEVSE: Final = _Serials(
     encode=_word,
-    # FollowUp dialects: the last of twelve registers. The checksum behind it would tell.
+    # Later dialects: the last of twelve registers. The checksum behind it would tell.
     in_frame=re.compile(rb"(?s)(?<=\A.\x04\x18.{22}).{1,4}"),
     rest=re.compile(rb"(?!)"),
     unmistakable=False,

@@ -1,4 +1,4 @@
-"""Selects: what decides how much a box offers, now and after a power failure."""
+"""Selects: the mode of a box, now and after a power failure."""
 
 from collections.abc import Hashable, Iterable
 from typing import Final, override
@@ -17,7 +17,7 @@ from .managed_charger import ManagedCharger
 PARALLEL_UPDATES = 0
 
 MODES: Final = tuple(Mode)
-"""A box's own number of a mode is its place in here."""
+"""In the order of the numbers that a box stores."""
 
 MODE: Final = SelectEntityDescription(
     key="mode", translation_key="mode", options=[str(mode) for mode in MODES]
@@ -26,7 +26,7 @@ MODE_AT_START: Final = SelectEntityDescription(
     key=f"setting_{Setting.MODE_AT_START}",
     translation_key=f"setting_{Setting.MODE_AT_START}",
     entity_category=EntityCategory.CONFIG,
-    # The memory of a box bears a limited number of writes.
+    # The memory of a box endures a limited number of writes.
     entity_registry_enabled_default=False,
     options=[str(mode) for mode in MODES],
 )
@@ -52,24 +52,24 @@ def _selects(
 
 
 class ModeSelect(ChargerEntity, SelectEntity):
-    """What decides how much the box offers; it forgets that without power."""
+    """The current mode of a box, which it loses with the power."""
 
     @override
     def update_attributes(self) -> Hashable:
-        """Show what the box says."""
+        """Show the mode last read."""
         reading = self.charger.reading
         self._attr_current_option = reading.mode if reading is not None else None
         return self._attr_current_option
 
     @override
     async def async_select_option(self, option: str) -> None:
-        """Command it; return when the box follows."""
+        """Set the mode; return when the box has confirmed it."""
         with translated_errors(self.managed.name, self.coordinator.port):
             await self.charger.command(Command.SET_MODE, Mode(option))
 
 
 class ModeAtStartSelect(SettingEntity, SelectEntity):
-    """The mode in which a box starts; kept in its own memory."""
+    """The mode in which a box starts, stored in its own memory."""
 
     def __init__(
         self,
@@ -77,18 +77,18 @@ class ModeAtStartSelect(SettingEntity, SelectEntity):
         managed: ManagedCharger,
         description: SelectEntityDescription,
     ) -> None:
-        """Belong to the charger."""
+        """Initialize the select."""
         super().__init__(coordinator, managed, description, Setting.MODE_AT_START)
 
     @override
     def update_attributes(self) -> Hashable:
-        """Show what the box told."""
-        told = self.stored_value
-        self._attr_current_option = None if told is None else MODES[told]
-        return told
+        """Show the stored mode."""
+        number = self.stored_value
+        self._attr_current_option = None if number is None else MODES[number]
+        return number
 
     @override
     async def async_select_option(self, option: str) -> None:
-        """Write it into the box; return when it is read back."""
+        """Write the mode to the box; return when it is read back."""
         with translated_errors(self.managed.name, self.coordinator.port):
             await self.charger.configure(self.setting, MODES.index(Mode(option)))

@@ -1,4 +1,4 @@
-"""Sensors: what chargers say, and what the bus counts."""
+"""Sensors: readings of the chargers, and statistics of the bus."""
 
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
@@ -37,24 +37,22 @@ from .entity import (
 )
 from .evse.model import Capability, Fault
 from .managed_charger import ManagedCharger
-from .sensor_counts import (
+from .sensor_tables import (
     BUS_SENSORS,
+    CHARGER_SENSORS,
     CHARGER_STATISTICS,
     CONNECTED_BOXES,
-    LISTENER_SENSORS,
-    BusSensorDescription,
-    StatisticDescription,
-)
-from .sensor_tables import (
-    CHARGER_SENSORS,
     CONNECTOR_SENSORS,
     ENERGY,
     ESTIMATED_ENERGY,
     FAULT,
+    LISTENER_SENSORS,
     NO_FAULT,
     WAITING,
+    BusSensorDescription,
     ChargerSensorDescription,
     ConnectorSensorDescription,
+    StatisticDescription,
 )
 
 PARALLEL_UPDATES = 0
@@ -75,8 +73,10 @@ async def async_setup_entry(
             for description in BUS_SENSORS
         )
     if isinstance(lines := coordinator.connections, ListenerConnections):
-        boxes = BusSensor(coordinator, CONNECTED_BOXES, lambda: lines.connected, BUS)
-        async_add_entities([boxes])
+        connected = BusSensor(
+            coordinator, CONNECTED_BOXES, lambda: lines.connected, BUS
+        )
+        async_add_entities([connected])
         async_add_entities(
             BusSensor(coordinator, counted, partial(counted.value, lines.listener))
             for counted in LISTENER_SENSORS
@@ -92,9 +92,12 @@ def _sensors(
     for description in supported(managed, CHARGER_SENSORS):
         yield ChargerSensor(coordinator, managed, description)
     for statistic in CHARGER_STATISTICS:
-        # Another charger may be behind it after a changed set-up.
+        # Looks the charger up at each use: a changed configuration may replace it.
         yield ChargerStatistic(
-            coordinator, managed, statistic, partial(_counted, managed, statistic)
+            coordinator,
+            managed,
+            statistic,
+            partial(_charger_statistic, managed, statistic),
         )
     if Capability.FAULTS in charger.capabilities:
         yield FaultSensor(coordinator, managed, FAULT)
@@ -110,32 +113,32 @@ def _sensors(
 def _line_sensors(
     coordinator: BusCoordinator, managed: ManagedCharger
 ) -> Iterable[SensorEntity]:
-    """Return what is counted of the line that a box has for itself."""
+    """Return the statistics of a line that a box has for itself."""
     if managed.is_primary_port and coordinator.bus is None:
         for description in BUS_SENSORS:
             yield ChargerStatistic(
                 coordinator,
                 managed,
                 description,
-                partial(_counted_of_line, managed, description),
-                whole=True,
+                partial(_bus_statistic, managed, description),
+                of_box=True,
             )
 
 
-def _counted(
+def _charger_statistic(
     managed: ManagedCharger, description: StatisticDescription
 ) -> float | None:
     return description.value(managed.charger)
 
 
-def _counted_of_line(
+def _bus_statistic(
     managed: ManagedCharger, description: BusSensorDescription
 ) -> float | None:
     return description.value(managed.bus)
 
 
 class _ValueSensor(EvseBusEntity, SensorEntity):
-    """A sensor whose state is one value."""
+    """A sensor that shows a single value."""
 
     @override
     def update_attributes(self) -> Hashable:
@@ -144,12 +147,12 @@ class _ValueSensor(EvseBusEntity, SensorEntity):
         return value
 
     def value(self) -> str | float | datetime | None:
-        """Return what to show."""
+        """Return the value to show."""
         raise NotImplementedError
 
 
 class BusSensor(BusEntity, _ValueSensor):
-    """Something of a port's bus, or of a listener."""
+    """A statistic of a bus or a listener."""
 
     def __init__(
         self,
@@ -158,18 +161,18 @@ class BusSensor(BusEntity, _ValueSensor):
         value: Callable[[], float | None],
         context: Context = STATISTICS,
     ) -> None:
-        """Be told from time to time, or in another context."""
+        """Initialize the sensor; statistics are updated at intervals."""
         super().__init__(coordinator, description, context)
         self._value = value
 
     @override
     def value(self) -> float | None:
-        """Return what was counted."""
+        """Return the value of the statistic."""
         return self._value()
 
 
 class ChargerSensor(ChargerEntity, _ValueSensor):
-    """Something a charger says of itself."""
+    """A reading of a charger."""
 
     def __init__(
         self,
@@ -177,18 +180,18 @@ class ChargerSensor(ChargerEntity, _ValueSensor):
         managed: ManagedCharger,
         description: ChargerSensorDescription,
     ) -> None:
-        """Be told with the charger."""
-        super().__init__(coordinator, managed, description, whole=description.whole)
+        """Initialize the sensor."""
+        super().__init__(coordinator, managed, description, of_box=description.of_box)
         self._value = description.value
 
     @override
     def value(self) -> str | float | None:
-        """Return what the charger said."""
+        """Return the value last read."""
         return self._value(self.charger)
 
 
 class ChargerStatistic(ChargerEntity, _ValueSensor):
-    """A count about a charger or its line; there also when nobody answers."""
+    """A statistic of a charger or its line, available even if it does not answer."""
 
     def __init__(
         self,
@@ -197,34 +200,34 @@ class ChargerStatistic(ChargerEntity, _ValueSensor):
         description: SensorEntityDescription,
         value: Callable[[], float | None],
         *,
-        whole: bool = False,
+        of_box: bool = False,
     ) -> None:
-        """Be told from time to time."""
-        super().__init__(coordinator, managed, description, STATISTICS, whole=whole)
+        """Initialize the sensor, which is updated at intervals."""
+        super().__init__(coordinator, managed, description, STATISTICS, of_box=of_box)
         self._value = value
 
     @override
     def is_available(self) -> bool:
-        """Return true: how often it did not answer is best known then."""
+        """Return true: the counters matter most while the charger does not answer."""
         return True
 
     @override
     def value(self) -> float | None:
-        """Return what was counted."""
+        """Return the value of the statistic."""
         return self._value()
 
 
 class FaultSensor(ChargerEntity, SensorEntity):
-    """The most important fault; all of them are in the attributes."""
+    """The most important fault; the attributes list all of them."""
 
     @override
     def is_available(self) -> bool:
-        """Return whether there is anything to say; we notice some things ourselves."""
+        """Return whether it answers; a fault detected by us shows even if it does not."""
         return self.charger.available or bool(self.charger.noticed)
 
     @override
     def update_attributes(self) -> Hashable:
-        """Show the first fault in the order of their list; waiting comes last."""
+        """Show the first fault in the order of `Fault`, reasons for waiting last."""
         faults = [fault for fault in Fault if fault in self.charger.faults]
         faults.sort(key=lambda fault: fault in WAITING)
         reading = self.charger.reading
@@ -238,7 +241,7 @@ class FaultSensor(ChargerEntity, SensorEntity):
 
 
 class ConnectorSensor(ConnectorEntity, _ValueSensor):
-    """Something a charger says of one connector."""
+    """A reading of one connector."""
 
     def __init__(
         self,
@@ -247,25 +250,25 @@ class ConnectorSensor(ConnectorEntity, _ValueSensor):
         number: int,
         description: ConnectorSensorDescription,
     ) -> None:
-        """Be told with the connector."""
+        """Initialize the sensor."""
         super().__init__(coordinator, managed, number, description)
         self._value = description.value
 
     @override
     def value(self) -> str | float | datetime | None:
-        """Return what the charger said."""
+        """Return the value last read."""
         reading = self.reading
         return None if reading is None else self._value(reading)
 
 
 class EnergySensor(ConnectorEntity, RestoreSensor):
-    """The meter's total; what another meter has counted before is left out."""
+    """The total of the meter; a jump to the value of another meter is left out."""
 
     @override
     async def async_added_to_hass(self) -> None:
-        """Go on from where the last run ended."""
+        """Restore the total of the last run."""
         self._total = MeterTotal()
-        self._kept_at = dt_util.utcnow()
+        self._stored_at = dt_util.utcnow()
         data = await self.async_get_last_sensor_data()
         extra = await self.async_get_last_extra_data()
         state = await self.async_get_last_state()
@@ -273,24 +276,26 @@ class EnergySensor(ConnectorEntity, RestoreSensor):
             offset = extra.as_dict().get("offset")
             if is_energy(data.native_value) and is_energy(offset):
                 self._total = MeterTotal(offset=offset, total=data.native_value)
-                self._kept_at = state.last_updated
+                self._stored_at = state.last_updated
         await super().async_added_to_hass()
 
     @override
     def update_attributes(self) -> Hashable:
-        """Show the total; unknown while the meter is not told."""
+        """Show the total; unknown while there is no meter reading."""
         reading = self.reading
         shown = None
         if reading is not None and reading.energy is not None:
-            away = (dt_util.utcnow() - self._kept_at).total_seconds()
-            shown = self._total.take(reading.energy, reading.meter_generation, away)
+            downtime = (dt_util.utcnow() - self._stored_at).total_seconds()
+            shown = self._total.update(
+                reading.energy, reading.meter_generation, downtime
+            )
         self._attr_native_value = shown
         return shown
 
     @property
     @override
     def extra_restore_state_data(self) -> MeterData:
-        """Return what is kept for the next run."""
+        """Return the data to store for the next run."""
         return MeterData(
             self._total.total, self.native_unit_of_measurement, self._total.offset
         )
@@ -298,22 +303,22 @@ class EnergySensor(ConnectorEntity, RestoreSensor):
 
 @dataclass
 class MeterData(SensorExtraStoredData):
-    """What is kept of a meter's total."""
+    """Stored data of a meter's total."""
 
     offset: float
 
     @override
     def as_dict(self) -> dict[str, Any]:
-        """Return it as it is stored."""
+        """Return the data as it is stored."""
         return {**super().as_dict(), "offset": self.offset}
 
 
 class EstimatedEnergySensor(ConnectorEntity, RestoreSensor):
-    """Estimated energy: summed by the library since its start, and by us before."""
+    """Estimated energy: the sum of the library, continued across restarts."""
 
     @override
     async def async_added_to_hass(self) -> None:
-        """Go on from where the last run ended."""
+        """Restore the total of the last run."""
         self._total = SummedTotal()
         last = await self.async_get_last_sensor_data()
         if last is not None and is_energy(last.native_value):
@@ -322,15 +327,15 @@ class EstimatedEnergySensor(ConnectorEntity, RestoreSensor):
 
     @override
     def update_attributes(self) -> Hashable:
-        """Add what came since the last look."""
+        """Add the energy since the last update."""
         reading = self.reading
         summed = reading.estimated_energy if reading is not None else None
         if summed is not None:
-            self._total.take(summed, self.charger)
+            self._total.update(summed, self.charger)
         self._attr_native_value = shown = round(self._total.total, 3)
         return shown
 
 
 def is_energy(value: object) -> TypeGuard[float]:
-    """Return whether a stored value can be used as an energy."""
+    """Return whether a stored value is a usable energy."""
     return isinstance(value, (int, float)) and isfinite(value)

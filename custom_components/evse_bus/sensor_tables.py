@@ -1,4 +1,4 @@
-"""The tables of all sensors."""
+"""Tables of the sensors: readings of chargers and connectors, and statistics."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,6 +12,7 @@ from homeassistant.components.sensor import (
     SensorStateClass,
 )
 from homeassistant.const import (
+    PERCENTAGE,
     EntityCategory,
     UnitOfElectricCurrent,
     UnitOfElectricPotential,
@@ -22,23 +23,25 @@ from homeassistant.const import (
 )
 from homeassistant.util import dt as dt_util
 
+from .evse.bus import Bus
 from .evse.charger import Charger
+from .evse.ews import Listener
 from .evse.model import Capability, Fault, Phases, SessionResult, Status
 from .evse.readings import ChargerReading, ConnectorReading
 
 NO_FAULT: Final = "none"
 
 WAITING: Final = frozenset({Fault.LESS_6A, Fault.NO_CURRENT, Fault.NO_SUN})
-"""What a box tells among its faults, and is none: it waits for current or the sun."""
+"""Reported among the faults of a box, but none: it waits for current or the sun."""
 
 
 class FailSafe(StrEnum):
-    """What a charger does when it no longer hears from Home Assistant."""
+    """Behaviour of a charger that no longer hears from Home Assistant."""
 
     NOTHING = "nothing"
-    """The last limit stands."""
+    """It keeps its last limit."""
     FALLS_BACK = "falls_back"
-    """It charges with its fail-safe current after its time-out."""
+    """It charges at its fail-safe current after its time-out."""
     STOPS = "stops"
     ENDS = "ends"
     """It ends the charge after 10 min, and unlocks the plug (EWS-Box)."""
@@ -46,17 +49,17 @@ class FailSafe(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class ChargerSensorDescription(SensorEntityDescription):
-    """Something a charger says of itself."""
+    """Description of a reading of a charger."""
 
     capability: Capability | None = None
     value: Callable[[Charger], str | float | None]
-    whole: bool = False
-    """Of the whole box, where that has several ports."""
+    of_box: bool = False
+    """One sensor for a box, however many ports it has."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ConnectorSensorDescription(SensorEntityDescription):
-    """Something a charger says of one connector."""
+    """Description of a reading of one connector."""
 
     capability: Capability
     value: Callable[[ConnectorReading], str | float | datetime | None]
@@ -112,10 +115,10 @@ def _one_phase(
     return lambda reading: phases(reading)[index]
 
 
-def _told(
+def _reading_value(
     value: Callable[[ChargerReading], float | None],
 ) -> Callable[[Charger], float | None]:
-    """Return how to get at a reading that may not be there."""
+    """Return a getter for a value of the charger's reading, if there is one."""
     return lambda charger: None if charger.reading is None else value(charger.reading)
 
 
@@ -125,7 +128,7 @@ def _per_phase(
     phases: Callable[[ConnectorReading], Phases[float | None]],
     traits: dict[str, Any],
 ) -> tuple[ConnectorSensorDescription, ...]:
-    """Return one description for each of L1, L2, L3."""
+    """Return three descriptions: L1, L2 and L3."""
     return tuple(
         ConnectorSensorDescription(
             key=f"{key}_{phase}",
@@ -142,7 +145,7 @@ def _per_phase(
 def _pilot(
     key: str, value: Callable[[ConnectorReading], float | None]
 ) -> ConnectorSensorDescription:
-    """Return the description of a voltage that only helps to find a fault."""
+    """Return the description of a voltage that serves to find faults."""
     return ConnectorSensorDescription(
         key=key,
         translation_key=key,
@@ -155,15 +158,15 @@ def _pilot(
 
 
 def _local(clock: datetime | None) -> datetime | None:
-    """Return what a box's clock showed as a time; it is kept in our zone."""
+    """Return the time on a box's clock, which is set to our time zone."""
     if clock is None:
         return None
     return clock.replace(tzinfo=dt_util.get_default_time_zone())
 
 
 def _fail_safe(charger: Charger) -> FailSafe | None:
-    """Return what a charger does in silence; ``None``: that is not known yet."""
-    # A fail-safe current alone may be just for orders that nobody renews.
+    """Return the behaviour of a charger without us; ``None``: not known yet."""
+    # A fail-safe current without a time-out may apply to expired orders only.
     if Capability.FAIL_SAFE_TIMEOUT in charger.capabilities:
         return FailSafe.FALLS_BACK
     if charger.follows_master:
@@ -238,7 +241,7 @@ CONNECTOR_SENSORS: Final[tuple[ConnectorSensorDescription, ...]] = (
         translation_key="session_energy",
         capability=Capability.SESSION,
         value=lambda reading: reading.session_energy,
-        # Begins anew with each charge, which this class is made for.
+        # Starts again at 0 with each charge, as this state class allows.
         state_class=SensorStateClass.TOTAL_INCREASING,
         **_SESSION_ENERGY,
     ),
@@ -281,7 +284,7 @@ CONNECTOR_SENSORS: Final[tuple[ConnectorSensorDescription, ...]] = (
     ConnectorSensorDescription(
         key="user",
         translation_key="user",
-        # Who charges where and when is private, and the recorder keeps it.
+        # Private: the recorder would store who charged when.
         entity_registry_enabled_default=False,
         capability=Capability.CARDS,
         value=lambda reading: reading.user,
@@ -302,7 +305,7 @@ CHARGER_SENSORS: Final[tuple[ChargerSensorDescription, ...]] = (
         key="offered_current",
         translation_key="offered_current",
         capability=Capability.OFFERED_CURRENT,
-        value=_told(lambda reading: reading.offered_current),
+        value=_reading_value(lambda reading: reading.offered_current),
         **_CURRENT,
     ),
     ChargerSensorDescription(
@@ -310,7 +313,7 @@ CHARGER_SENSORS: Final[tuple[ChargerSensorDescription, ...]] = (
         translation_key="maximum_current",
         entity_category=EntityCategory.DIAGNOSTIC,
         capability=Capability.MAXIMUM_CURRENT,
-        value=_told(lambda reading: reading.maximum_current),
+        value=_reading_value(lambda reading: reading.maximum_current),
         **_CURRENT,
     ),
     ChargerSensorDescription(
@@ -320,7 +323,7 @@ CHARGER_SENSORS: Final[tuple[ChargerSensorDescription, ...]] = (
         native_unit_of_measurement=UnitOfTemperature.CELSIUS,
         state_class=SensorStateClass.MEASUREMENT,
         capability=Capability.TEMPERATURE,
-        value=_told(lambda reading: reading.temperature),
+        value=_reading_value(lambda reading: reading.temperature),
     ),
     ChargerSensorDescription(
         key="fail_safe",
@@ -329,7 +332,7 @@ CHARGER_SENSORS: Final[tuple[ChargerSensorDescription, ...]] = (
         device_class=SensorDeviceClass.ENUM,
         options=[str(one) for one in FailSafe],
         value=_fail_safe,
-        whole=True,
+        of_box=True,
     ),
 )
 
@@ -339,4 +342,180 @@ FAULT: Final = SensorEntityDescription(
     entity_category=EntityCategory.DIAGNOSTIC,
     device_class=SensorDeviceClass.ENUM,
     options=[NO_FAULT, *(str(fault) for fault in Fault)],
+)
+
+
+# -- Statistics: all but the connected boxes are disabled by default ------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class BusSensorDescription(SensorEntityDescription):
+    """Description of a statistic of a bus."""
+
+    value: Callable[[Bus], float | None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StatisticDescription(SensorEntityDescription):
+    """Description of a statistic of a charger."""
+
+    value: Callable[[Charger], float | None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ListenerSensorDescription(SensorEntityDescription):
+    """Description of a statistic of a listener."""
+
+    value: Callable[[Listener], float | None]
+
+
+_COUNT: Final[dict[str, Any]] = {
+    "entity_category": EntityCategory.DIAGNOSTIC,
+    "entity_registry_enabled_default": False,
+    "state_class": SensorStateClass.TOTAL_INCREASING,
+}
+_ROUND_TRIP: Final[dict[str, Any]] = {
+    "entity_category": EntityCategory.DIAGNOSTIC,
+    "entity_registry_enabled_default": False,
+    "device_class": SensorDeviceClass.DURATION,
+    "native_unit_of_measurement": UnitOfTime.SECONDS,
+    "suggested_unit_of_measurement": UnitOfTime.MILLISECONDS,
+    "state_class": SensorStateClass.MEASUREMENT,
+    "suggested_display_precision": 1,
+}
+
+
+CHARGER_STATISTICS: Final[tuple[StatisticDescription, ...]] = (
+    StatisticDescription(
+        key="requests",
+        translation_key="requests",
+        value=lambda charger: charger.statistics.requests,
+        **_COUNT,
+    ),
+    StatisticDescription(
+        key="timeouts",
+        translation_key="timeouts",
+        value=lambda charger: charger.statistics.timeouts,
+        **_COUNT,
+    ),
+    StatisticDescription(
+        key="bad_frames",
+        translation_key="bad_frames",
+        value=lambda charger: charger.statistics.bad_frames,
+        **_COUNT,
+    ),
+    StatisticDescription(
+        key="reasserted",
+        translation_key="reasserted",
+        value=lambda charger: charger.statistics.reasserted,
+        **_COUNT,
+    ),
+    StatisticDescription(
+        key="missed_deadlines",
+        translation_key="missed_deadlines",
+        value=lambda charger: charger.statistics.missed_deadlines,
+        **_COUNT,
+    ),
+    StatisticDescription(
+        key="round_trip",
+        translation_key="round_trip",
+        value=lambda charger: charger.statistics.round_trip_mean,
+        **_ROUND_TRIP,
+    ),
+)
+
+
+def _mean_round_trip(bus: Bus) -> float | None:
+    """Return the mean time from request to reply over all chargers, s."""
+    all_statistics = [charger.statistics for charger in bus.chargers.values()]
+    replies = sum(statistics.replies for statistics in all_statistics)
+    total = sum(statistics.round_trip_sum for statistics in all_statistics)
+    return total / replies if replies else None
+
+
+def _utilisation(bus: Bus) -> float | None:
+    share = bus.wire.statistics.utilisation(bus.now)
+    return None if share is None else share * 100
+
+
+BUS_SENSORS: Final[tuple[BusSensorDescription, ...]] = (
+    BusSensorDescription(
+        key="requests",
+        translation_key="requests",
+        value=lambda bus: bus.wire.statistics.requests,
+        **_COUNT,
+    ),
+    BusSensorDescription(
+        key="timeouts",
+        translation_key="timeouts",
+        value=lambda bus: bus.wire.statistics.timeouts,
+        **_COUNT,
+    ),
+    BusSensorDescription(
+        key="bad_frames",
+        translation_key="bad_frames",
+        value=lambda bus: bus.wire.statistics.bad_frames,
+        **_COUNT,
+    ),
+    BusSensorDescription(
+        key="foreign_frames",
+        translation_key="foreign_frames",
+        value=lambda bus: bus.wire.statistics.foreign_frames,
+        **_COUNT,
+    ),
+    BusSensorDescription(
+        key="missed_deadlines",
+        translation_key="missed_deadlines",
+        value=lambda bus: bus.wire.statistics.missed_deadlines,
+        **_COUNT,
+    ),
+    BusSensorDescription(
+        key="reconnects",
+        translation_key="reconnects",
+        value=lambda bus: bus.wire.statistics.reopened,
+        **_COUNT,
+    ),
+    BusSensorDescription(
+        key="round_trip",
+        translation_key="round_trip",
+        value=_mean_round_trip,
+        **_ROUND_TRIP,
+    ),
+    BusSensorDescription(
+        key="utilisation",
+        translation_key="utilisation",
+        entity_category=EntityCategory.DIAGNOSTIC,
+        entity_registry_enabled_default=False,
+        native_unit_of_measurement=PERCENTAGE,
+        state_class=SensorStateClass.MEASUREMENT,
+        suggested_display_precision=1,
+        value=_utilisation,
+    ),
+)
+
+
+CONNECTED_BOXES: Final = SensorEntityDescription(
+    key="connected_boxes",
+    translation_key="connected_boxes",
+    entity_category=EntityCategory.DIAGNOSTIC,
+    state_class=SensorStateClass.MEASUREMENT,
+)
+
+
+def _listener_count(
+    key: str, value: Callable[[Listener], float]
+) -> ListenerSensorDescription:
+    return ListenerSensorDescription(
+        key=key, translation_key=key, value=value, **_COUNT
+    )
+
+
+LISTENER_SENSORS: Final[tuple[ListenerSensorDescription, ...]] = (
+    _listener_count("accepted", lambda listener: listener.statistics.accepted),
+    _listener_count("not_allowed", lambda listener: listener.statistics.not_allowed),
+    _listener_count("crowded_out", lambda listener: listener.statistics.crowded_out),
+    _listener_count("unidentified", lambda listener: listener.statistics.unidentified),
+    _listener_count("strangers", lambda listener: listener.statistics.strangers),
+    _listener_count("seconds", lambda listener: listener.statistics.seconds),
+    _listener_count("replaced", lambda listener: listener.statistics.replaced),
 )

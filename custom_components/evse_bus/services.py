@@ -1,4 +1,4 @@
-"""The actions: what a P-CHARGE EWS-Box can do that no entity stands for.
+"""Actions: functions of a P-CHARGE EWS-Box that no entity covers.
 
 Each takes a device: a box, or one of its ports. The other fields are checked in
 `actions/`, with an error that names the field.
@@ -42,23 +42,23 @@ CONF_TOTAL: Final = "total"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Action:
-    """One action: what it takes, who may call it, and what it does."""
+    """One action: its fields, the required rights, and its function."""
 
     run: Callable[[EwsPort, Mapping[str, Any]], Awaitable[ServiceResponse]]
     required: tuple[str, ...] = ()
     optional: tuple[str, ...] = ()
     admin: bool = True
-    """Only administrators may: it changes what is set up, or tells what is private."""
+    """Only for administrators: it changes the configuration or returns private data."""
     responds: bool = False
-    """It only tells something."""
+    """It returns data and changes nothing."""
     of_port: bool = False
-    """It means one port; the others mean the whole box."""
+    """It applies to one port; the others apply to the whole box."""
     unconfirmed: ActionError | None = None
-    """What is said when the box does not confirm it; ``None``: as of any command."""
+    """Error if the box does not confirm it; ``None``: that of any command."""
 
     @property
     def schema(self) -> vol.Schema:
-        """Return what its data looks like; the values are checked when it runs."""
+        """Return the schema of its fields; their values are checked when it runs."""
         return vol.Schema(
             {vol.Required(ATTR_DEVICE_ID): cv.string}
             | {vol.Required(key): cv.match_all for key in self.required}
@@ -83,7 +83,7 @@ ACTIONS: Final[Mapping[str, Action]] = {
         run=cards.accept_card,
         required=(cards.CONF_GROUP, cards.CONF_NUMBER),
         optional=(cards.CONF_USER, cards.CONF_TAG),
-        # For an automation that answers whoever holds a card to the reader.
+        # Not for administrators only: an automation may accept a presented card.
         admin=False,
     ),
     "read_card_list": Action(
@@ -115,7 +115,7 @@ ACTIONS: Final[Mapping[str, Action]] = {
 
 @callback
 def async_register(hass: HomeAssistant) -> None:
-    """Register the actions: once, whatever becomes of the buses."""
+    """Register the actions, independent of any config entry."""
     for name, action in ACTIONS.items():
         register = (
             partial(async_register_admin_service, hass)
@@ -151,10 +151,10 @@ async def _async_run(action: Action, call: ServiceCall) -> ServiceResponse:
 def _target(
     call: ServiceCall, *, of_port: bool
 ) -> tuple[BusCoordinator, ManagedCharger, EwsPort]:
-    """Return who is meant; raises ServiceValidationError.
+    """Return the charger that an action applies to; raises ServiceValidationError.
 
-    The box stands for its first port: that is as good as any for what concerns the
-    whole box. ``of_port``: only where it has no other.
+    The device of a box selects its first port, which serves for the whole box.
+    ``of_port``: only if the box has no other port.
     """
     entry: EvseBusConfigEntry
     device, entry = async_get_device_and_config_entry(

@@ -1,4 +1,4 @@
-"""Switches: may a car charge, and what the box itself can have on or off."""
+"""Switches: the permission to charge, and features of a box."""
 
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ PARALLEL_UPDATES = 0
 
 @dataclass(frozen=True, kw_only=True)
 class CommandSwitchDescription(SwitchEntityDescription):
-    """Something of the box that a command sets and a reading shows."""
+    """Description of a feature that a command sets and a reading reports."""
 
     capability: Capability
     command: Command
@@ -36,7 +36,7 @@ class CommandSwitchDescription(SwitchEntityDescription):
 
 @dataclass(frozen=True, kw_only=True)
 class ConnectorSwitchDescription(SwitchEntityDescription):
-    """Something of one connector that commands set and a reading shows."""
+    """Description of a feature of one connector, set by commands."""
 
     capability: Capability
     turn_on: tuple[Command, bool | None]
@@ -45,11 +45,11 @@ class ConnectorSwitchDescription(SwitchEntityDescription):
 
 
 def _option(name: str) -> Callable[[Charger], bool | None]:
-    """Return how to read a configuration bit that the charger told."""
+    """Return a getter for a configuration bit of the charger."""
 
     def value(charger: Charger) -> bool | None:
-        told = charger.info.options.get(name) if charger.info else None
-        return told if isinstance(told, bool) else None
+        option = charger.info.options.get(name) if charger.info else None
+        return option if isinstance(option, bool) else None
 
     return value
 
@@ -132,46 +132,46 @@ class _ChargerSwitch(ChargerEntity, SwitchEntity):
 
     @override
     async def async_turn_on(self, **kwargs: Any) -> None:
-        """Switch on; return when the charger follows."""
+        """Switch on; return when the charger has confirmed it."""
         with translated_errors(self.managed.name, self.coordinator.port):
-            await self.turn(on=True)
+            await self.async_set(on=True)
 
     @override
     async def async_turn_off(self, **kwargs: Any) -> None:
-        """Switch off; return when the charger follows."""
+        """Switch off; return when the charger has confirmed it."""
         with translated_errors(self.managed.name, self.coordinator.port):
-            await self.turn(on=False)
+            await self.async_set(on=False)
 
-    async def turn(self, *, on: bool) -> None:
-        """Tell the charger; raises EvseError."""
+    async def async_set(self, *, on: bool) -> None:
+        """Send the new state to the charger; raises EvseError."""
         raise NotImplementedError
 
 
 class AllowedSwitch(_ChargerSwitch):
-    """Whether a car may charge; apart from how much."""
+    """Permission to charge, independent of the limit."""
 
     @override
     def update_attributes(self) -> Hashable:
-        """Show what the charger says; where it cannot, what was ordered.
+        """Show the permission that the charger reports, else the one ordered.
 
-        What is stopped by ourselves for want of current is allowed: nobody has to
-        switch it on again.
+        A charger that we have paused for lack of current stays allowed: it resumes
+        without being switched on again.
         """
         charger = self.charger
-        told = charger.reading.allowed if charger.reading is not None else None
-        if told is None or (told is False and charger.waits_for_current):
-            told = charger.orders.allowed is not False
-        self._attr_is_on = told
-        return told
+        allowed = charger.reading.allowed if charger.reading is not None else None
+        if allowed is None or (allowed is False and charger.waits_for_current):
+            allowed = charger.orders.allowed is not False
+        self._attr_is_on = allowed
+        return allowed
 
     @override
-    async def turn(self, *, on: bool) -> None:
-        """Order it."""
+    async def async_set(self, *, on: bool) -> None:
+        """Change the order."""
         await self.charger.change_orders(OrderChange(allowed=on))
 
 
 class CommandSwitch(_ChargerSwitch):
-    """Something of the box that a command sets and a reading shows."""
+    """A feature of the box that a command sets and a reading reports."""
 
     def __init__(
         self,
@@ -179,25 +179,25 @@ class CommandSwitch(_ChargerSwitch):
         managed: ManagedCharger,
         description: CommandSwitchDescription,
     ) -> None:
-        """Belong to the charger."""
+        """Initialize the switch."""
         super().__init__(coordinator, managed, description)
         self._value = description.value
         self._command = description.command
 
     @override
     def update_attributes(self) -> Hashable:
-        """Show what the charger says."""
+        """Show the state last read."""
         self._attr_is_on = self._value(self.charger)
         return self._attr_is_on
 
     @override
-    async def turn(self, *, on: bool) -> None:
-        """Command it."""
+    async def async_set(self, *, on: bool) -> None:
+        """Send the command."""
         await self.charger.command(self._command, on)
 
 
 class ConnectorSwitch(ConnectorEntity, _ChargerSwitch):
-    """Something of one connector that commands set and a reading shows."""
+    """A feature of one connector that commands set and a reading reports."""
 
     def __init__(
         self,
@@ -206,21 +206,21 @@ class ConnectorSwitch(ConnectorEntity, _ChargerSwitch):
         number: int,
         description: ConnectorSwitchDescription,
     ) -> None:
-        """Belong to the connector."""
+        """Initialize the switch."""
         super().__init__(coordinator, managed, number, description)
         self._description = description
 
     @override
     def update_attributes(self) -> Hashable:
-        """Show what the charger says."""
+        """Show the state last read."""
         reading = self.reading
         value = None if reading is None else self._description.value(reading)
         self._attr_is_on = value
         return value
 
     @override
-    async def turn(self, *, on: bool) -> None:
-        """Command it."""
+    async def async_set(self, *, on: bool) -> None:
+        """Send the command."""
         description = self._description
         command, value = description.turn_on if on else description.turn_off
         await self.charger.command(command, value)

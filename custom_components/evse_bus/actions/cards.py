@@ -1,4 +1,4 @@
-"""Actions for the cards of an EWS-Box: accepting one, and the box's own list."""
+"""Actions for the cards of an EWS-Box: accept one, read and write its card list."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
@@ -31,15 +31,15 @@ CONF_KIND: Final = "kind"
 USER_LENGTH: Final = 8
 KINDS: Final = {kind.name.lower(): kind for kind in EntryKind}
 UNKNOWN_KIND: Final = "unknown"
-"""Of an entry whose kind is not in the manual."""
+"""Kind of an entry whose code is not in the manual."""
 
 _NUMBER: Final[Check[int]] = whole(1, LARGEST)
-"""0 is no number of a group or card."""
+"""Number of a group or card; 0 is not valid."""
 _ENTRY_FIELDS: Final = (CONF_ENTRY, CONF_KIND, CONF_GROUP, CONF_NUMBER)
 
 
 async def accept_card(port: EwsPort, given: Mapping[str, object]) -> None:
-    """Accept a card for the next start, or log somebody in."""
+    """Accept a card for the next start, or log in a user."""
     card = AcceptedCard(
         group=_NUMBER(CONF_GROUP, given[CONF_GROUP]),
         number=_NUMBER(CONF_NUMBER, given[CONF_NUMBER]),
@@ -50,7 +50,7 @@ async def accept_card(port: EwsPort, given: Mapping[str, object]) -> None:
 
 
 async def read_card_list(port: EwsPort, _given: Mapping[str, object]) -> JsonObjectType:
-    """Return the entries of the box's own list that are in use."""
+    """Return the entries in use of the box's card list."""
     cards = await port.services.read_cards()
     return {
         CONF_ENTRIES: [
@@ -61,7 +61,7 @@ async def read_card_list(port: EwsPort, _given: Mapping[str, object]) -> JsonObj
 
 
 def _show(at: int, entry: CardEntry) -> JsonObjectType:
-    """Return an entry in words, and the code of its kind: the manual is not sure."""
+    """Return an entry; also the code of its kind, which the manual leaves unclear."""
     kind = entry.kind
     return {
         CONF_ENTRY: at,
@@ -73,18 +73,18 @@ def _show(at: int, entry: CardEntry) -> JsonObjectType:
 
 
 async def write_card_list(port: EwsPort, given: Mapping[str, object]) -> None:
-    """Replace some entries of the box's own list; the others stay as they are."""
+    """Replace some entries of the box's card list; the others stay unchanged."""
     changes = _entries(given[CONF_ENTRIES])
     try:
         await port.services.write_cards(changes)
     except RefusedOrderError as error:
-        # Each entry is right by itself: it is about whom another one is.
+        # Each entry is valid in itself: another one has the same card.
         raise wrong_action(ActionError.CARD_TWICE) from error
 
 
 def _entries(given: object) -> dict[int, CardEntry]:
-    """Return the entries that are meant; raises ServiceValidationError."""
-    # A single one may stand without a list around it.
+    """Return the checked entries; raises ServiceValidationError."""
+    # A single entry needs no list around it.
     listed = given if isinstance(given, list) else [given]
     if not listed:
         raise wrong_action(ActionError.NOTHING_TO_CHANGE)
@@ -108,7 +108,7 @@ def _entries(given: object) -> dict[int, CardEntry]:
 def _entry(path: str, given: Mapping[str, object]) -> CardEntry:
     kind = option(KINDS)(f"{path}.{CONF_KIND}", given[CONF_KIND])
     numbers = [
-        # What is not meant may be left out, or 0 as it is read.
+        # An unused number may be left out, or 0 as in `read_card_list`.
         whole(0, LARGEST)(f"{path}.{name}", given.get(name, 0))
         for name in (CONF_GROUP, CONF_NUMBER)
     ]

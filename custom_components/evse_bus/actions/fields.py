@@ -1,8 +1,8 @@
-"""What may stand in the fields of the actions for an EWS-Box. Pure.
+"""Checks for the fields of the actions for an EWS-Box. Pure.
 
-A value comes from a form, from YAML or from a template. What cannot be meant raises
-ServiceValidationError, which names the field; never the value, since some are
-passwords. That the library would take what passes here is tested.
+A value comes from a form, from YAML or from a template. An invalid one raises
+ServiceValidationError, which names the field but never the value: some are passwords.
+The library accepts every value that passes here (tested).
 """
 
 from collections.abc import Callable, Mapping
@@ -18,13 +18,13 @@ from ..evse.ews.cards import TAG_LENGTH
 from ..evse.ews.commands import MINIMUM_LIMIT
 
 type Check[V] = Callable[[str, object], V]
-"""Takes the name of a field and what was given, returns what is meant."""
+"""Takes the name of a field and its value, returns the converted value."""
 
 HIGHEST_LIMIT: Final = 80
-"""What a control pilot can offer, A."""
+"""Highest current of a control pilot (IEC 61851-1), A."""
 PIN_LENGTH: Final = 4
 _WATT_HOURS: Final = Decimal(1000)
-"""In a kilowatt-hour."""
+"""Per kilowatt-hour."""
 _HIGHEST_TOTAL: Final = Decimal(0xFFFFFFFF) / _WATT_HOURS
 """kWh; the box has 32 bits for watt-hours."""
 
@@ -33,11 +33,11 @@ _HIGHEST_TOTAL: Final = Decimal(0xFFFFFFFF) / _WATT_HOURS
 
 
 def _finite(value: object) -> Decimal | None:
-    """Return a number as it was written; ``None``: it is none, or not finite."""
+    """Return a number as it was written; ``None``: not a number, or not finite."""
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         return None
     try:
-        # A float by its digits, as it was written: 0.1 is not 0.1000000000000000055.
+        # A float by its shortest digits: 0.1 must not become 0.1000000000000000055.
         number = Decimal(value if isinstance(value, int) else str(value))
     except InvalidOperation:
         return None
@@ -49,7 +49,7 @@ def whole(minimum: int, maximum: int) -> Check[int]:
 
     def check(key: str, value: object) -> int:
         number = _finite(value)
-        # The range first: a number with a thousand digits is not worth an integer.
+        # The range first: int() of a number with a huge exponent is expensive.
         if number is None or not minimum <= number <= maximum or number != int(number):
             raise wrong_action(
                 ActionError.FIELD_WHOLE_NUMBER,
@@ -63,7 +63,7 @@ def whole(minimum: int, maximum: int) -> Check[int]:
 
 
 def limit(key: str, value: object) -> int:
-    """Check a highest current in whole amperes; 0: none of its own."""
+    """Check a maximum current in whole amperes; 0: no limit of its own."""
     number = _finite(value)
     if number is None or number not in (0, *range(MINIMUM_LIMIT, HIGHEST_LIMIT + 1)):
         raise wrong_action(
@@ -76,13 +76,13 @@ def limit(key: str, value: object) -> int:
 
 
 def meter_total(key: str, value: object) -> int:
-    """Check what a meter is to show in kWh; return it in Wh."""
+    """Check the new value of a meter in kWh; return it in Wh."""
     number = _finite(value)
     if number is None or not 0 <= number <= _HIGHEST_TOTAL:
         raise wrong_action(
             ActionError.FIELD_NUMBER, field=key, minimum=0, maximum=_HIGHEST_TOTAL
         )
-    # A meter reading out of a template may have lost its last digit to a float.
+    # The value of a template may have lost its last digit to a float.
     return int((number * _WATT_HOURS).to_integral_value(ROUND_HALF_EVEN))
 
 
@@ -90,18 +90,18 @@ def meter_total(key: str, value: object) -> int:
 
 
 def _written(value: object) -> str | None:
-    """Return a text; a template makes a number of digits. ``None``: it is none."""
+    """Return a text; a template turns digits into a number. ``None``: not a text."""
     if isinstance(value, bool) or not isinstance(value, (str, int)):
         return None
     try:
         return str(value)
     except ValueError:
-        # Thousands of digits.
+        # str() refuses an integer of thousands of digits.
         return None
 
 
 def secret(length: int) -> Check[str]:
-    """Return the check for a password: as `text`, but spaces around it count."""
+    """Return the check for a password: as `text`, but spaces at its ends count."""
 
     def check(key: str, value: object) -> str:
         written = _written(value)
@@ -110,7 +110,7 @@ def secret(length: int) -> Check[str]:
         try:
             written.encode("latin-1")
         except UnicodeEncodeError:
-            # Without the cause: it has the password in it.
+            # `from None`: the cause contains the password.
             raise wrong_action(ActionError.FIELD_SIGNS, field=key) from None
         if written and not written.isprintable():
             raise wrong_action(ActionError.FIELD_SIGNS, field=key)
@@ -120,7 +120,7 @@ def secret(length: int) -> Check[str]:
 
 
 def text(length: int) -> Check[str]:
-    """Return the check for a text of so many signs that the box knows (Latin-1)."""
+    """Return the check for a text of at most ``length`` Latin-1 characters."""
     check_secret = secret(length)
 
     def check(key: str, value: object) -> str:
@@ -145,9 +145,9 @@ def pin(key: str, value: object) -> str:
 
 
 def tag(key: str, value: object) -> bytes:
-    """Check the number of a card's chip, in hexadecimal digits."""
+    """Check the number of a card's chip, hexadecimal digits."""
     digits = (_written(value) or "").strip()
-    # Without spaces between them, which `bytes.fromhex` would take.
+    # `bytes.fromhex` would accept spaces between the digits.
     if len(digits) == 2 * TAG_LENGTH and digits.isalnum():
         try:
             return bytes.fromhex(digits)
@@ -168,7 +168,7 @@ def address(key: str, value: object) -> IPv4Address:
 
 
 def netmask(key: str, value: object) -> IPv4Address:
-    """Check a netmask: all ones stand before all zeros."""
+    """Check a netmask: its ones come before its zeros."""
     mask = address(key, value)
     zeros = int(mask) ^ 0xFFFFFFFF
     if zeros & (zeros + 1):
@@ -180,7 +180,7 @@ def netmask(key: str, value: object) -> IPv4Address:
 
 
 def switch(key: str, value: object) -> bool:
-    """Check whether something is on."""
+    """Check an on/off value, as a boolean or a word."""
     if isinstance(value, (bool, str)):
         try:
             return cv.boolean(value)
@@ -190,7 +190,7 @@ def switch(key: str, value: object) -> bool:
 
 
 def option[V](options: Mapping[str, V]) -> Check[V]:
-    """Return the check for one of some words."""
+    """Return the check for one of several words."""
 
     def check(key: str, value: object) -> V:
         if not isinstance(value, str) or value not in options:

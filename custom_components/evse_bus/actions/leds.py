@@ -1,4 +1,4 @@
-"""Action for the LEDs of an EWS-Box that has given them to its server."""
+"""Action for the LEDs of an EWS-Box in the mode that gives them to the server."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
@@ -27,7 +27,7 @@ STATES: Final[Mapping[str, Led | None]] = {
     UNCHANGED: LED_UNCHANGED,
 }
 LONGEST: Final = 0xFFFE
-"""ms; one more means always."""
+"""ms; the next higher value means always."""
 DEFAULT_TIME: Final = 500
 """ms"""
 TIMES: Final[Mapping[str, tuple[int, int, int]]] = {
@@ -35,7 +35,7 @@ TIMES: Final[Mapping[str, tuple[int, int, int]]] = {
     "time_off": (1, LONGEST, DEFAULT_TIME),
     "offset": (0, LONGEST, 0),
 }
-"""Lowest, highest and usual value of what stands behind the name of an LED, ms."""
+"""Suffixes of an LED's time fields: lowest, highest and default value, ms."""
 
 
 def time_keys(led: str) -> tuple[str, ...]:
@@ -47,7 +47,7 @@ FIELDS: Final = (*LEDS, *(key for led in LEDS for key in time_keys(led)))
 
 
 async def set_leds(port: EwsPort, given: Mapping[str, object]) -> None:
-    """Set LEDs of one port; the other port's stay as they are."""
+    """Set the LEDs of one port; those of the other port stay unchanged."""
     leds = port_leds(given)
     other = PortLeds()
     if leds == other:
@@ -57,21 +57,21 @@ async def set_leds(port: EwsPort, given: Mapping[str, object]) -> None:
 
 
 def port_leds(given: Mapping[str, object]) -> PortLeds:
-    """Return what the LEDs are to do; raises ServiceValidationError."""
+    """Return the new state of the LEDs; raises ServiceValidationError."""
     return PortLeds(**{led: _led(led, given) for led in LEDS})
 
 
 def _led(led: str, given: Mapping[str, object]) -> Led:
     state = given.get(led, UNCHANGED)
     if isinstance(state, bool):
-        # YAML takes the words on and off for these.
+        # YAML reads the words on and off as booleans.
         state = "on" if state else "off"
     steady = option(STATES)(led, state)
     if steady is None:
         return blinking(
             *(
-                whole(lowest, highest)(key, given.get(key, usual))
-                for key, (lowest, highest, usual) in zip(
+                whole(lowest, highest)(key, given.get(key, default))
+                for key, (lowest, highest, default) in zip(
                     time_keys(led), TIMES.values(), strict=True
                 )
             )

@@ -1,8 +1,8 @@
-"""Actions for what is set in an EWS-Box: one table for each block of parameters.
+"""Actions for the parameters of an EWS-Box: one table for each block.
 
-A table says by which names people change what stands in a block. Bits have names of
-their own; those that are not named stay as they are, whatever the box has made of
-them meanwhile. Passwords go to the box and never come back.
+A table maps the fields of an action to those of a block. Single bits are fields of
+their own; bits that an action does not name keep their current value in the box.
+Passwords can be written, but are never returned.
 """
 
 from collections.abc import Callable, Mapping
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 CONF_BLOCK: Final = "block"
 SECRETS: Final = "secrets"
-"""Where a response says whether passwords were told: never the passwords."""
+"""Key in a response: how the box returned each password, never a password itself."""
 DHCP: Final = "dhcp"
 
 LOCK_TYPES: Final = {kind.name.lower(): kind for kind in LockType}
@@ -57,25 +57,25 @@ _BYTE: Final = 0xFF
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Parameter:
-    """One field of an action, and where it stands in the box."""
+    """One field of an action, and its place in a block."""
 
     key: str
-    """Its name in the action, and in the library unless `name` says otherwise."""
+    """Its name in the action; in the library, too, unless `name` is set."""
     check: Check[Any]
     name: str = ""
     bit: IntFlag | None = None
-    """The one bit of the library's field that it is."""
+    """The bit of the library's field, where it is a single bit."""
     show: Callable[[Any], JsonValueType] | None = None
-    """What a response says; ``None``: the value as it is."""
+    """Conversion for a response; ``None``: the value itself."""
 
     @property
-    def within(self) -> str:
-        """Return the library's field that it is, or is a bit of."""
+    def field(self) -> str:
+        """Return the name of the library's field."""
         return self.name or self.key
 
-    def response(self, told: object) -> JsonValueType:
-        """Return what a block that was read says of it."""
-        value: Any = getattr(told, self.within)
+    def response(self, values: object) -> JsonValueType:
+        """Return its value from a block that was read."""
+        value: Any = getattr(values, self.field)
         if self.bit is not None:
             return self.bit in value
         return value if self.show is None else self.show(value)
@@ -88,17 +88,17 @@ class ActionBlock[T]:
     block: Block[T]
     parameters: tuple[Parameter, ...]
     codes: tuple[str, ...] = ()
-    """The library's fields of which a response tells the number as well.
+    """Fields that a response also contains as numbers.
 
-    A box may know more of them than its manual.
+    A box may use more codes than its manual lists.
     """
 
     def changes(
         self, given: Mapping[str, object]
     ) -> Callable[[T], Mapping[str, object]]:
-        """Return what makes the changes that are meant, of what stands in the box.
+        """Return a function from the current values to the changed fields.
 
-        Raises ServiceValidationError for what cannot be meant.
+        Raises ServiceValidationError for an invalid value, or if nothing changes.
         """
         whole_fields: dict[str, object] = {}
         bits: dict[str, dict[IntFlag, bool]] = {}
@@ -107,37 +107,39 @@ class ActionBlock[T]:
                 continue
             value = parameter.check(parameter.key, given[parameter.key])
             if parameter.bit is None:
-                whole_fields[parameter.within] = value
+                whole_fields[parameter.field] = value
             else:
-                bits.setdefault(parameter.within, {})[parameter.bit] = value
+                bits.setdefault(parameter.field, {})[parameter.bit] = value
         if not whole_fields and not bits:
             raise wrong_action(ActionError.NOTHING_TO_CHANGE)
-        return lambda told: (
+        return lambda current: (
             whole_fields
             | {
-                name: _with_bits(getattr(told, name), changed)
+                name: _with_bits(getattr(current, name), changed)
                 for name, changed in bits.items()
             }
         )
 
-    def response(self, told: T) -> JsonObjectType:
-        """Return a block that was read, without its secrets."""
-        secrets = self.block.secrets_told(told)
+    def response(self, values: T) -> JsonObjectType:
+        """Return the values of a block that was read, without its secrets."""
+        secrets = self.block.secrets_told(values)
         response: JsonObjectType = {
-            parameter.key: parameter.response(told)
+            parameter.key: parameter.response(values)
             for parameter in self.parameters
-            if parameter.within not in self.block.secrets
+            if parameter.field not in self.block.secrets
         }
         if self.codes:
-            response["codes"] = {name: int(getattr(told, name)) for name in self.codes}
+            response["codes"] = {
+                name: int(getattr(values, name)) for name in self.codes
+            }
         if secrets:
-            response[SECRETS] = {name: how.value for name, how in secrets.items()}
+            response[SECRETS] = {name: state.value for name, state in secrets.items()}
         return response
 
 
 def _with_bits(flags: IntFlag, changed: Mapping[IntFlag, bool]) -> IntFlag:
-    """Return flags with some bits changed, those that nobody knows kept."""
-    # With plain numbers, because `flags & ~bit` drops what is no member.
+    """Return flags with some bits changed; unknown bits keep their value."""
+    # As integers: `flags & ~bit` would drop bits that are no member.
     value = int(flags)
     for bit, on in changed.items():
         value = value | int(bit) if on else value & ~int(bit)
@@ -145,7 +147,7 @@ def _with_bits(flags: IntFlag, changed: Mapping[IntFlag, bool]) -> IntFlag:
 
 
 def _word_for(options: Mapping[str, int]) -> Callable[[int], str | None]:
-    """Return what names a number; ``None`` for one that is not in the manual."""
+    """Return a getter for the word of a number; ``None``: not in the manual."""
     words = {int(value): word for word, value in options.items()}
     return words.get
 
@@ -246,7 +248,7 @@ BLOCKS: Final[Mapping[str, ActionBlock[Any]]] = {
     "extra": EXTRA,
 }
 READABLE: Final = (*BLOCKS, DHCP)
-"""What `read_parameters` offers."""
+"""Blocks that `read_parameters` offers."""
 
 
 def keys_of(block: str) -> tuple[str, ...]:
@@ -256,28 +258,31 @@ def keys_of(block: str) -> tuple[str, ...]:
 
 async def read_parameters(port: EwsPort, given: Mapping[str, object]) -> JsonObjectType:
     """Return one block of parameters, without its secrets."""
-    asked = option({block: block for block in READABLE})(CONF_BLOCK, given[CONF_BLOCK])
-    if asked == DHCP:
+    name = option({block: block for block in READABLE})(CONF_BLOCK, given[CONF_BLOCK])
+    if name == DHCP:
         return _dhcp(await port.services.read_dhcp())
-    chosen = BLOCKS[asked]
-    return chosen.response(await port.services.read_parameters(chosen.block))
+    action_block = BLOCKS[name]
+    values = await port.services.read_parameters(action_block.block)
+    return action_block.response(values)
 
 
-def _dhcp(told: Dhcp) -> JsonObjectType:
+def _dhcp(lease: Dhcp) -> JsonObjectType:
     return {
-        "address": str(told.address),
-        "netmask": str(told.netmask),
-        "gateway": str(told.gateway),
-        "server": str(told.server),
-        "server_real": str(told.server_real),
-        "lease": told.lease,
-        "lease_left": told.lease_left,
+        "address": str(lease.address),
+        "netmask": str(lease.netmask),
+        "gateway": str(lease.gateway),
+        "server": str(lease.server),
+        "server_real": str(lease.server_real),
+        "lease": lease.lease,
+        "lease_left": lease.lease_left,
     }
 
 
 async def write_parameters(
     block: str, port: EwsPort, given: Mapping[str, object]
 ) -> None:
-    """Change what is named of a block; the rest stays as it is."""
-    chosen = BLOCKS[block]
-    await port.services.change_parameters(chosen.block, chosen.changes(given))
+    """Change the given fields of a block; the others stay unchanged."""
+    action_block = BLOCKS[block]
+    await port.services.change_parameters(
+        action_block.block, action_block.changes(given)
+    )

@@ -131,7 +131,7 @@ class ChargerSubentryFlow(
             unique_id=charger["unique_id"],
         )
 
-    # -- FollowUp -------------------------------------------------------------------
+    # -- Reconfiguration ---------------------------------------------------------
 
     async def async_step_reconfigure(
         self, user_input: dict[str, Any] | None = None
