@@ -1,4 +1,4 @@
-"""FollowUp dialects need quiet: their own cycle stands still while others ask."""
+"""Later dialects need quiet: their own cycle stands still while others ask."""
 
 import asyncio
 from itertools import pairwise

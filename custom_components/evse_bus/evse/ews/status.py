@@ -195,7 +195,7 @@ class Details:
     power: Pair[int] = coded(pair(Number(width=4, unit="W", possible=_WATTS)))
     """W. The manual calls it energy; its unit is that of power."""
     pwm_duty: Pair[int] = coded(pair(Number(width=1, unit="%", possible=_PERCENT)))
-    """BusMaster cycle of the control pilot, %."""
+    """Duty cycle of the control pilot, %."""
     pilot_code: Pair[int] = coded(pair(Number(width=1)))
     """"Low-level PWM state A", raw."""
     cable_code: Pair[int] = coded(pair(Number(width=1)))

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from .slave import SlaveSmartEvse
 
 ANSWER_WITHIN: Final = 0.8
-"""FollowUp than this a request is not answered, s: after 1 s the box has given it up, and
+"""Later than this a request is not answered, s: after 1 s the box has given it up, and
 would close its contactor on a late word all the same. It asks again."""
 ANSWER_BYTES: Final = LONGEST_REQUEST
 """A broadcast may go in its place."""

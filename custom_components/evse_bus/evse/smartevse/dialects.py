@@ -26,7 +26,7 @@ class Dialect(StrEnum):
     V2_17 = "2.17"
     V2_20 = "2.20"
     LATER = "later"
-    """FollowUp 2.x, and 3.x."""
+    """Later 2.x, and 3.x."""
 
 
 # -- Contents ----------------------------------------------------------------------
