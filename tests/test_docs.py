@@ -16,17 +16,17 @@ from custom_components.evse_bus import (
     sensor_tables,
     switch,
 )
-from custom_components.evse_bus.evse.ews.listener import (
+from custom_components.evse_bus.evse.ews.box import Installation
+from custom_components.evse_bus.evse.ews.network.listener import (
     IDENTIFY_TIME,
     MOST_UNIDENTIFIED,
 )
-from custom_components.evse_bus.evse.ews.parameters import SystemMode
 from custom_components.evse_bus.evse.ews.readings import capabilities_of
-from custom_components.evse_bus.evse.ews.session import Installation
 from custom_components.evse_bus.evse.ews.timing import (
     COMMAND_MARGIN,
     COMMAND_TIMEOUT,
 )
+from custom_components.evse_bus.evse.ews.wire.parameters import SystemMode
 from custom_components.evse_bus.evse.protocols import PROTOCOLS
 from custom_components.evse_bus.flows.listener import FIRST_PORT
 from custom_components.evse_bus.flows.schema import default_of

@@ -8,7 +8,7 @@ from homeassistant.core import HomeAssistant
 from homeassistant.util import dt as dt_util
 import pytest
 
-from custom_components.evse_bus.evse.ews.session import EwsBox as EwsSession
+from custom_components.evse_bus.evse.ews.box import EwsBox as EwsSession
 from tests.common import get_entity, running
 from tests.ews import polled
 from tests.virtual import EwsBox

@@ -17,7 +17,7 @@ from custom_components.evse_bus.diagnostics import (
     async_get_config_entry_diagnostics,
     async_get_device_diagnostics,
 )
-from custom_components.evse_bus.evse.ews import accepted
+from custom_components.evse_bus.evse.ews.network import line
 from tests.common import (
     call,
     get_entity,
@@ -227,7 +227,7 @@ async def test_nothing_private_over_the_network(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    monkeypatch.setattr(accepted, "ANSWER_PATIENCE", 1.0)
+    monkeypatch.setattr(line, "ANSWER_PATIENCE", 1.0)
     caplog.set_level(logging.DEBUG)
     box = private_box()
     async with listening(

@@ -11,7 +11,7 @@ import pytest
 from custom_components.evse_bus.diagnostics import (
     async_get_config_entry_diagnostics,
 )
-from custom_components.evse_bus.evse.ews import accepted, listener as listening_to
+from custom_components.evse_bus.evse.ews.network import line, listener as listening_to
 from tests.common import (
     call,
     ews_charger,
@@ -116,7 +116,7 @@ async def test_a_half_open_connection_ends(
     hass: HomeAssistant, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A box that vanished is gone for us, too, and its next connection counts."""
-    monkeypatch.setattr(accepted, "ANSWER_PATIENCE", 1.5)
+    monkeypatch.setattr(line, "ANSWER_PATIENCE", 1.5)
     box = EwsBox()
     async with listening(hass, box) as (entry, (dialler,)):
         status = await get_entity(hass, "sensor", entry, "1_status")

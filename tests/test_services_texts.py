@@ -23,9 +23,9 @@ from custom_components.evse_bus.actions.parameters import (
 from custom_components.evse_bus.const import DOMAIN
 from custom_components.evse_bus.errors import EWS_KEYS, ActionError
 from custom_components.evse_bus.evse.errors import RefusedOrderError
-from custom_components.evse_bus.evse.ews.answers import Refusal
-from custom_components.evse_bus.evse.ews.cards import ENTRIES, LARGEST
-from custom_components.evse_bus.evse.ews.commands import PortLeds, set_leds
+from custom_components.evse_bus.evse.ews.wire.answers import Refusal
+from custom_components.evse_bus.evse.ews.wire.cards import ENTRIES, LARGEST
+from custom_components.evse_bus.evse.ews.wire.commands import PortLeds, set_leds
 from custom_components.evse_bus.services import ACTIONS
 from tests.flow import english
 

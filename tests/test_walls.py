@@ -25,7 +25,7 @@ PURE = (
     "states",
     "plausibility",
 )
-"""Files of a protocol folder that know no line and no conversation."""
+"""Files of a protocol folder that know no line and no conversation, beside `wire/`."""
 
 LIBRARY_MAY = {"pymodbus", "serialx"}
 """Third-party packages the library may import, all told in the README."""
@@ -86,7 +86,7 @@ def test_the_clamp_and_the_schedule_are_pure() -> None:
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_protocols_do_not_know_each_other(protocol: str) -> None:
     others = set(PROTOCOLS) - {protocol}
-    for path in (EVSE / protocol).glob("*.py"):
+    for path in (EVSE / protocol).rglob("*.py"):
         used = {name.split(".")[0] for name in local(path, EVSE)}
         assert not used & others, path
         assert "protocols" not in used, path
@@ -110,8 +110,9 @@ def test_only_the_line_knows_serialx_and_only_modbus_knows_pymodbus() -> None:
 def test_pure_parts_of_a_protocol_do_not_talk() -> None:
     talking = {"bus", "line", "exchange", "jobs", "charger", "turns"}
     for protocol in PROTOCOLS:
-        for name in PURE:
-            path = EVSE / protocol / f"{name}.py"
+        folder = EVSE / protocol
+        named = (folder / f"{name}.py" for name in PURE)
+        for path in (*named, *(folder / "wire").glob("*.py")):
             if path.exists():
                 used = {one.split(".")[-1] for one in local(path, EVSE)}
                 assert not used & talking, path

@@ -33,8 +33,8 @@ from .evse.errors import (
     SupersededError,
     WrongChargerError,
 )
-from .evse.ews.answers import EwsRefusedError, Refusal
-from .evse.ews.parameters import HiddenSecretError
+from .evse.ews.wire.answers import EwsRefusedError, Refusal
+from .evse.ews.wire.parameters import HiddenSecretError
 
 # The first class that matches counts, so subclasses come before their base.
 _PORT_KEYS: Final[tuple[tuple[type[LineError], str], ...]] = (

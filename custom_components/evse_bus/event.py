@@ -23,7 +23,7 @@ from .evse.ews.events import (
     Event,
     StartRequested,
 )
-from .evse.ews.info import KEYS, KeyEvent
+from .evse.ews.wire.info import KEYS, KeyEvent
 from .evse.model import Capability
 from .managed_charger import ManagedCharger
 

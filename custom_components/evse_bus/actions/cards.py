@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Final
 
 from ..errors import ActionError, wrong_action
 from ..evse.errors import RefusedOrderError
-from ..evse.ews.cards import (
+from ..evse.ews.wire.cards import (
     ENTRIES,
     LARGEST,
     AcceptedCard,

@@ -14,8 +14,8 @@ from homeassistant.helpers import config_validation as cv
 import probatio as vol
 
 from ..errors import ActionError, wrong_action
-from ..evse.ews.cards import TAG_LENGTH
-from ..evse.ews.commands import MINIMUM_LIMIT
+from ..evse.ews.wire.cards import TAG_LENGTH
+from ..evse.ews.wire.commands import MINIMUM_LIMIT
 
 type Check[V] = Callable[[str, object], V]
 """Takes the name of a field and its value, returns the converted value."""

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
 
 from ..errors import ActionError, wrong_action
-from ..evse.ews.commands import (
+from ..evse.ews.wire.commands import (
     LED_OFF,
     LED_ON,
     LED_UNCHANGED,

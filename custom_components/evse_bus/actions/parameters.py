@@ -11,7 +11,7 @@ from enum import IntFlag
 from typing import TYPE_CHECKING, Any, Final
 
 from ..errors import ActionError, wrong_action
-from ..evse.ews.parameters import (
+from ..evse.ews.wire.parameters import (
     EXTRA_BLOCK,
     INSTALLATION_BLOCK,
     SOURCE_PORTS,
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from homeassistant.util.json import JsonObjectType, JsonValueType
 
     from ..evse.ews import EwsPort
-    from ..evse.ews.box import Dhcp
+    from ..evse.ews.wire.box_status import Dhcp
 
 CONF_BLOCK: Final = "block"
 SECRETS: Final = "secrets"

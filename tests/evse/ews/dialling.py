@@ -9,7 +9,7 @@ import time
 from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.ews.charger import EwsPort
 from custom_components.evse_bus.evse.ews.config import EwsPortConfig
-from custom_components.evse_bus.evse.ews.listener import Listener
+from custom_components.evse_bus.evse.ews.network.listener import Listener
 from custom_components.evse_bus.evse.model import CurrentLimit, Orders
 from tests.virtual.ews_box import EwsBox as VirtualBox
 from tests.virtual.ews_dialler import EwsDialler

@@ -6,7 +6,7 @@ from custom_components.evse_bus.evse.errors import (
     ExchangeRefusedError,
     ImplausibleReplyError,
 )
-from custom_components.evse_bus.evse.ews.answers import (
+from custom_components.evse_bus.evse.ews.wire.answers import (
     COMMAND_REFUSALS,
     MESSAGES,
     START_STOP_CODES,
@@ -18,8 +18,8 @@ from custom_components.evse_bus.evse.ews.answers import (
     decode_firmware_id,
     decode_reset,
 )
-from custom_components.evse_bus.evse.ews.commands import CONFIRMED, READS
-from custom_components.evse_bus.evse.ews.frames import (
+from custom_components.evse_bus.evse.ews.wire.commands import CONFIRMED, READS
+from custom_components.evse_bus.evse.ews.wire.frames import (
     Bcc,
     CommandId,
     EwsFrame,

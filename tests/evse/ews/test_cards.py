@@ -7,7 +7,7 @@ from custom_components.evse_bus.evse.errors import (
     ImplausibleReplyError,
     RefusedOrderError,
 )
-from custom_components.evse_bus.evse.ews.cards import (
+from custom_components.evse_bus.evse.ews.wire.cards import (
     ENTRIES,
     LARGEST,
     AcceptedCard,
@@ -19,7 +19,7 @@ from custom_components.evse_bus.evse.ews.cards import (
     decode_cards,
     write_cards,
 )
-from custom_components.evse_bus.evse.ews.frames import Bcc, CommandId
+from custom_components.evse_bus.evse.ews.wire.frames import Bcc, CommandId
 
 from .wire import message
 

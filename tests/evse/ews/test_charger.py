@@ -10,7 +10,7 @@ from custom_components.evse_bus.evse.errors import (
 )
 from custom_components.evse_bus.evse.ews import PROTOCOL
 from custom_components.evse_bus.evse.ews.config import EwsPortConfig
-from custom_components.evse_bus.evse.ews.frames import Bcc
+from custom_components.evse_bus.evse.ews.wire.frames import Bcc
 from custom_components.evse_bus.evse.model import (
     Capability,
     Fault,

@@ -48,7 +48,7 @@ def test_a_new_line_begins_with_the_reading_that_was_right(
 def test_a_box_that_dials_again_is_there_at_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    accepted = "custom_components.evse_bus.evse.ews.accepted.ANSWER_PATIENCE"
+    accepted = "custom_components.evse_bus.evse.ews.network.line.ANSWER_PATIENCE"
     monkeypatch.setattr(accepted, 5.0)
 
     async def scene() -> None:

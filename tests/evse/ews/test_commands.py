@@ -9,7 +9,7 @@ from custom_components.evse_bus.evse.errors import (
     NotAvailableError,
     RefusedOrderError,
 )
-from custom_components.evse_bus.evse.ews.commands import (
+from custom_components.evse_bus.evse.ews.wire.commands import (
     LED_OFF,
     LED_ON,
     LED_UNCHANGED,
@@ -30,14 +30,14 @@ from custom_components.evse_bus.evse.ews.commands import (
     start_stop,
     write_rom,
 )
-from custom_components.evse_bus.evse.ews.frames import (
+from custom_components.evse_bus.evse.ews.wire.frames import (
     LONGEST_FRAME,
     Bcc,
     CommandId,
     Request,
 )
-from custom_components.evse_bus.evse.ews.states import StartStop
-from custom_components.evse_bus.evse.ews.status import decode_ports
+from custom_components.evse_bus.evse.ews.wire.states import StartStop
+from custom_components.evse_bus.evse.ews.wire.status import decode_ports
 from custom_components.evse_bus.evse.model import CurrentLimit, Limits, Orders
 from custom_components.evse_bus.evse.safety import Setpoint, clamp
 

@@ -12,7 +12,7 @@ from custom_components.evse_bus.evse.ews.events import (
     charge_ended,
     start_requested,
 )
-from custom_components.evse_bus.evse.ews.status import (
+from custom_components.evse_bus.evse.ews.wire.status import (
     Card,
     ChargeResult,
     PortStatus,

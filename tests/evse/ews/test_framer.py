@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from hypothesis import assume, given, strategies as st
 import pytest
 
-from custom_components.evse_bus.evse.ews.frames import (
+from custom_components.evse_bus.evse.ews.wire.frames import (
     LONGEST_FRAME,
     Bcc,
     CommandId,

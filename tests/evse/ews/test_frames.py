@@ -4,7 +4,7 @@ from hypothesis import given, strategies as st
 import pytest
 
 from custom_components.evse_bus.evse.errors import RefusedOrderError
-from custom_components.evse_bus.evse.ews.frames import (
+from custom_components.evse_bus.evse.ews.wire.frames import (
     LONGEST_FRAME,
     MAXIMUM_PARAMETERS,
     PRIVATE,

@@ -4,8 +4,8 @@ from hypothesis import given, strategies as st
 import pytest
 
 from custom_components.evse_bus.evse.errors import ImplausibleReplyError
-from custom_components.evse_bus.evse.ews.frames import EwsFramer
-from custom_components.evse_bus.evse.ews.info import (
+from custom_components.evse_bus.evse.ews.wire.frames import EwsFramer
+from custom_components.evse_bus.evse.ews.wire.info import (
     Change,
     Info,
     KeyEvent,

@@ -9,10 +9,10 @@ from custom_components.evse_bus.evse.errors import (
     PortBusyError,
     PortMissingError,
 )
-from custom_components.evse_bus.evse.ews import accepted, listener as listening
 from custom_components.evse_bus.evse.ews.charger import EwsPort
 from custom_components.evse_bus.evse.ews.config import EwsPortConfig
-from custom_components.evse_bus.evse.ews.listener import Listener, Stranger
+from custom_components.evse_bus.evse.ews.network import line, listener as listening
+from custom_components.evse_bus.evse.ews.network.listener import Listener, Stranger
 from custom_components.evse_bus.evse.model import CurrentLimit, OrderChange, Orders
 from tests.virtual import Car
 from tests.virtual.ews_box import EwsBox as VirtualBox
@@ -154,7 +154,7 @@ def test_a_half_open_connection_makes_room(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_a_half_open_connection_dies(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(accepted, "ANSWER_PATIENCE", 1.0)
+    monkeypatch.setattr(line, "ANSWER_PATIENCE", 1.0)
 
     async def scene() -> None:
         async with server() as made, expected(made) as bus:

@@ -6,7 +6,8 @@ from ipaddress import ip_address, ip_network
 import pytest
 
 from custom_components.evse_bus.evse.errors import PortMissingError
-from custom_components.evse_bus.evse.ews import Listener, listener as listening
+from custom_components.evse_bus.evse.ews import Listener
+from custom_components.evse_bus.evse.ews.network import listener as listening
 from custom_components.evse_bus.evse.model import Fault
 from tests.virtual.ews_box import EwsBox as VirtualBox
 

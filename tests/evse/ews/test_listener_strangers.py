@@ -8,10 +8,10 @@ import time
 import pytest
 
 from custom_components.evse_bus.evse import bus as bus_module
-from custom_components.evse_bus.evse.ews import listener as listening
-from custom_components.evse_bus.evse.ews.accepted import AcceptedLine
-from custom_components.evse_bus.evse.ews.info import KEYS
-from custom_components.evse_bus.evse.ews.session import MOST_KEYS
+from custom_components.evse_bus.evse.ews.box import MOST_KEYS
+from custom_components.evse_bus.evse.ews.network import listener as listening
+from custom_components.evse_bus.evse.ews.network.line import AcceptedLine
+from custom_components.evse_bus.evse.ews.wire.info import KEYS
 from custom_components.evse_bus.evse.throttle import LOSSES
 from tests.virtual.ews_box import EwsBox as VirtualBox
 

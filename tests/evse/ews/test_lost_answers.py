@@ -10,11 +10,11 @@ from custom_components.evse_bus.evse.errors import (
     NotAvailableError,
     NotConfirmedError,
 )
-from custom_components.evse_bus.evse.ews.answers import EwsRefusedError, Refusal
+from custom_components.evse_bus.evse.ews.box import Ports
 from custom_components.evse_bus.evse.ews.events import (
     ChargeEnded,
 )
-from custom_components.evse_bus.evse.ews.session import Ports
+from custom_components.evse_bus.evse.ews.wire.answers import EwsRefusedError, Refusal
 from custom_components.evse_bus.evse.model import Fault, OrderChange, Status
 
 from .ether import EwsScene, now, play

@@ -9,8 +9,8 @@ from custom_components.evse_bus.evse.errors import (
     ImplausibleReplyError,
     RefusedOrderError,
 )
-from custom_components.evse_bus.evse.ews.frames import Bcc
-from custom_components.evse_bus.evse.ews.parameters import (
+from custom_components.evse_bus.evse.ews.wire.frames import Bcc
+from custom_components.evse_bus.evse.ews.wire.parameters import (
     BLOCKS,
     EXTRA_BLOCK,
     INSTALLATION_BLOCK,

@@ -13,8 +13,8 @@ from custom_components.evse_bus.evse.ews.events import (
     ChargeStarted,
     StartRequested,
 )
-from custom_components.evse_bus.evse.ews.states import STATES
-from custom_components.evse_bus.evse.ews.status import ChargeResult
+from custom_components.evse_bus.evse.ews.wire.states import STATES
+from custom_components.evse_bus.evse.ews.wire.status import ChargeResult
 from custom_components.evse_bus.evse.model import OrderChange, Status
 
 from .ether import EwsScene, now, play

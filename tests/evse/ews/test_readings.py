@@ -6,14 +6,14 @@ from dataclasses import replace
 import pytest
 
 from custom_components.evse_bus.evse.ews import NETWORK, PROTOCOL
-from custom_components.evse_bus.evse.ews.box import decode_box
-from custom_components.evse_bus.evse.ews.parameters import SystemMode
+from custom_components.evse_bus.evse.ews.box import Installation, Told
 from custom_components.evse_bus.evse.ews.readings import (
     capabilities_of,
     charger_reading,
 )
-from custom_components.evse_bus.evse.ews.session import Installation, Told
-from custom_components.evse_bus.evse.ews.status import (
+from custom_components.evse_bus.evse.ews.wire.box_status import decode_box
+from custom_components.evse_bus.evse.ews.wire.parameters import SystemMode
+from custom_components.evse_bus.evse.ews.wire.status import (
     Card,
     ChargeResult,
     decode_details,

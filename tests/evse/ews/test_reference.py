@@ -6,8 +6,8 @@ import re
 
 import pytest
 
-from custom_components.evse_bus.evse.ews.frames import CommandId
-from custom_components.evse_bus.evse.ews.states import RULES, STATES
+from custom_components.evse_bus.evse.ews.wire.frames import CommandId
+from custom_components.evse_bus.evse.ews.wire.states import RULES, STATES
 
 PAGE = (Path(__file__).parents[3] / "docs/ews-protocol.md").read_text()
 ROWS = {

@@ -10,19 +10,20 @@ from zoneinfo import ZoneInfo
 import pytest
 
 from custom_components.evse_bus.evse.errors import NotConfirmedError, RefusedOrderError
-from custom_components.evse_bus.evse.ews.answers import EwsRefusedError, Refusal
-from custom_components.evse_bus.evse.ews.cards import (
+from custom_components.evse_bus.evse.ews.firmware import upload
+from custom_components.evse_bus.evse.ews.timing import TCP_TIMING
+from custom_components.evse_bus.evse.ews.wire.answers import EwsRefusedError, Refusal
+from custom_components.evse_bus.evse.ews.wire.cards import (
     AcceptedCard,
     EntryKind,
     card_entry,
 )
-from custom_components.evse_bus.evse.ews.commands import (
+from custom_components.evse_bus.evse.ews.wire.commands import (
     LED_ON,
     PortLeds,
     ReaderTarget,
 )
-from custom_components.evse_bus.evse.ews.firmware import upload
-from custom_components.evse_bus.evse.ews.parameters import (
+from custom_components.evse_bus.evse.ews.wire.parameters import (
     EXTRA_BLOCK,
     INSTALLATION_BLOCK,
     SYSTEM_BLOCK,
@@ -31,7 +32,6 @@ from custom_components.evse_bus.evse.ews.parameters import (
     SystemMode,
     SystemParameters,
 )
-from custom_components.evse_bus.evse.ews.timing import TCP_TIMING
 from tests.virtual.ews_parameters import SystemParameters as VirtualParameters
 from tests.virtual.ews_rfid import Card
 

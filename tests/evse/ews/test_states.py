@@ -6,8 +6,8 @@ from hypothesis import given, strategies as st
 import pytest
 
 from custom_components.evse_bus.evse.errors import NotAvailableError
-from custom_components.evse_bus.evse.ews.box import decode_box
-from custom_components.evse_bus.evse.ews.states import (
+from custom_components.evse_bus.evse.ews.wire.box_status import decode_box
+from custom_components.evse_bus.evse.ews.wire.states import (
     RULES,
     STATES,
     StartStop,
@@ -17,7 +17,7 @@ from custom_components.evse_bus.evse.ews.states import (
     port_state,
     state_of,
 )
-from custom_components.evse_bus.evse.ews.status import PortStatus, decode_ports
+from custom_components.evse_bus.evse.ews.wire.status import PortStatus, decode_ports
 from custom_components.evse_bus.evse.model import Fault, Status
 
 from .wire import BOX, PORTS

@@ -6,7 +6,7 @@ from ipaddress import IPv4Address
 import pytest
 
 from custom_components.evse_bus.evse.errors import ImplausibleReplyError
-from custom_components.evse_bus.evse.ews.box import (
+from custom_components.evse_bus.evse.ews.wire.box_status import (
     BoxFlags,
     BoxStatus,
     Dhcp,
@@ -14,7 +14,7 @@ from custom_components.evse_bus.evse.ews.box import (
     decode_box,
     decode_dhcp,
 )
-from custom_components.evse_bus.evse.ews.status import (
+from custom_components.evse_bus.evse.ews.wire.status import (
     Card,
     ChargeResult,
     Details,

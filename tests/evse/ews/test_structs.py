@@ -14,15 +14,15 @@ from custom_components.evse_bus.evse.errors import (
     ImplausibleReplyError,
     RefusedOrderError,
 )
-from custom_components.evse_bus.evse.ews import (
-    box,
+from custom_components.evse_bus.evse.ews.wire import (
+    box_status,
     cards,
     commands,
     info,
     parameters,
     status,
 )
-from custom_components.evse_bus.evse.ews.fields import (
+from custom_components.evse_bus.evse.ews.wire.fields import (
     Address,
     Ascii,
     Centivolts,
@@ -44,13 +44,13 @@ LENGTHS: dict[int, list[Struct[Any]]] = {
     9: [info.INFO],
     12: [cards.ACCEPTED_CARD],
     27: [parameters.SYSTEM],
-    28: [box.DHCP],
+    28: [box_status.DHCP],
     34: [parameters.USER],
     48: [commands.LEDS],
     54: [status.PORT, status.PORT_MODE_1],
     56: [status.DETAILS],
     64: [parameters.EXTRA],
-    105: [box.BOX],
+    105: [box_status.BOX],
     130: [parameters.INSTALLATION],
     256: [cards.CARD_LIST],
 }

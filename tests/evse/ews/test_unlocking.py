@@ -12,15 +12,15 @@ from custom_components.evse_bus.evse.errors import (
     NotAvailableError,
     NotConfirmedError,
 )
-from custom_components.evse_bus.evse.ews.answers import (
+from custom_components.evse_bus.evse.ews.wire.answers import (
     START_STOP_CODES,
     EwsRefusedError,
     Refusal,
 )
-from custom_components.evse_bus.evse.ews.commands import unlock
-from custom_components.evse_bus.evse.ews.info import Change, Info
-from custom_components.evse_bus.evse.ews.states import STATES
-from custom_components.evse_bus.evse.ews.status import decode_ports
+from custom_components.evse_bus.evse.ews.wire.commands import unlock
+from custom_components.evse_bus.evse.ews.wire.info import Change, Info
+from custom_components.evse_bus.evse.ews.wire.states import STATES
+from custom_components.evse_bus.evse.ews.wire.status import decode_ports
 from custom_components.evse_bus.evse.model import (
     Command,
     Fault,

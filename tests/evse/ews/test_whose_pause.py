@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from custom_components.evse_bus.evse.errors import EvseError
-from custom_components.evse_bus.evse.ews.session import Ports
+from custom_components.evse_bus.evse.ews.box import Ports
 from custom_components.evse_bus.evse.model import CurrentLimit, OrderChange, Orders
 
 from .ether import EwsScene, now, play

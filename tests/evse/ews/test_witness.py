@@ -7,9 +7,12 @@ from typing import Any
 
 from hypothesis import given, strategies as st
 
-from custom_components.evse_bus.evse.ews.answers import confirmed, decode_firmware_id
-from custom_components.evse_bus.evse.ews.box import decode_box, decode_dhcp
-from custom_components.evse_bus.evse.ews.cards import (
+from custom_components.evse_bus.evse.ews.wire.answers import (
+    confirmed,
+    decode_firmware_id,
+)
+from custom_components.evse_bus.evse.ews.wire.box_status import decode_box, decode_dhcp
+from custom_components.evse_bus.evse.ews.wire.cards import (
     AcceptedCard,
     EntryKind,
     accept_card,
@@ -17,7 +20,7 @@ from custom_components.evse_bus.evse.ews.cards import (
     decode_cards,
     write_cards,
 )
-from custom_components.evse_bus.evse.ews.commands import (
+from custom_components.evse_bus.evse.ews.wire.commands import (
     PortLeds,
     ReaderTarget,
     blinking,
@@ -28,14 +31,14 @@ from custom_components.evse_bus.evse.ews.commands import (
     set_meter,
     write_rom,
 )
-from custom_components.evse_bus.evse.ews.frames import CommandId, Request
-from custom_components.evse_bus.evse.ews.parameters import (
+from custom_components.evse_bus.evse.ews.wire.frames import CommandId, Request
+from custom_components.evse_bus.evse.ews.wire.parameters import (
     EXTRA_BLOCK,
     INSTALLATION_BLOCK,
     SYSTEM_BLOCK,
     USER_BLOCK,
 )
-from custom_components.evse_bus.evse.ews.status import (
+from custom_components.evse_bus.evse.ews.wire.status import (
     PortStatus,
     decode_details,
     decode_ports,

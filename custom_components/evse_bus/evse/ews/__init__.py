@@ -4,13 +4,13 @@ from dataclasses import replace
 from typing import Final
 
 from ..protocol import Protocol
+from .box import Ports
 from .charger import EwsPort
 from .config import EwsPortConfig
-from .frames import EwsFramer
-from .listener import Listener, Stranger
+from .network.listener import Listener, Stranger
 from .scan import scan
-from .session import Ports
 from .timing import SETTINGS, TCP_TIMING, TIMING
+from .wire.frames import EwsFramer
 
 PROTOCOL: Final = Protocol(
     key="ews",

@@ -24,18 +24,18 @@ from ..model import (
     Orders,
 )
 from ..safety import clamp
-from .commanding import conversation
+from .box import EwsBox
 from .config import EwsPortConfig
-from .frames import EwsFrame
-from .info import decode_info
+from .port_commands import conversation
 from .reader import EwsReader
 from .services import Services
-from .session import EwsBox
 from .timing import (
     FRESH,
     INFO_PAUSE,
     REASSERT_PAUSE,
 )
+from .wire.frames import EwsFrame
+from .wire.info import decode_info
 
 
 class EwsPort(EwsReader):

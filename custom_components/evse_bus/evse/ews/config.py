@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from datetime import tzinfo
 
 from ..model import ChargerConfig
-from .commands import PORTS
+from .wire.commands import PORTS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

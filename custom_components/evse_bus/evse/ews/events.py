@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from functools import partial
 import logging
 
-from .info import KeyEvent
-from .status import ChargeResult, PortStatus
+from .wire.info import KeyEvent
+from .wire.status import ChargeResult, PortStatus
 
 _LOGGER = logging.getLogger(__name__)
 

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 
 from ..errors import RefusedOrderError
 from ..exchange import Turn
-from .answers import confirmed
-from .commands import MAXIMUM_ROM_BYTES, activate_firmware, erase_rom, write_rom
-from .frames import CommandId, Request
 from .timing import ERASE_PATIENCE
+from .wire.answers import confirmed
+from .wire.commands import MAXIMUM_ROM_BYTES, activate_firmware, erase_rom, write_rom
+from .wire.frames import CommandId, Request
 
 if TYPE_CHECKING:
     from .charger import EwsPort

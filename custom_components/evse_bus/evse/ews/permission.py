@@ -19,11 +19,12 @@ from ..errors import (
 from ..exchange import Turn
 from ..model import Fault, OrderChange
 from ..safety import Setpoint
-from .answers import EwsRefusedError, Refusal
-from .commands import start_stop
-from .frames import CommandId, Request
 from .readings import RUNNING
-from .states import (
+from .timing import LOOK_AGAIN, READY_PATIENCE, READY_PAUSE, SETTLING
+from .wire.answers import EwsRefusedError, Refusal
+from .wire.commands import start_stop
+from .wire.frames import CommandId, Request
+from .wire.states import (
     ABORTED,
     AFTER_OUR_PAUSE,
     BLOCKED,
@@ -36,8 +37,7 @@ from .states import (
     WAITING,
     StartStop,
 )
-from .status import PortStatus, StartRelease
-from .timing import LOOK_AGAIN, READY_PATIENCE, READY_PAUSE, SETTLING
+from .wire.status import PortStatus, StartRelease
 
 if TYPE_CHECKING:
     from .reader import EwsReader

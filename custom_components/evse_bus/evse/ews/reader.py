@@ -12,7 +12,7 @@ from ..charger import Charger
 from ..errors import NotAvailableError, WrongChargerError
 from ..exchange import Turn
 from ..model import Capability, Fault, Limits, Orders
-from .accepted import AcceptedLine
+from .box import EwsBox
 from .config import EwsPortConfig
 from .events import (
     ChargeStarted,
@@ -22,9 +22,8 @@ from .events import (
     port_of,
     start_requested,
 )
-from .frames import LONGEST_FRAME
-from .limiting import Limiter
-from .parameters import SystemMode
+from .limit import Limiter
+from .network.line import AcceptedLine
 from .permission import Permission
 from .readings import (
     RUNNING,
@@ -34,9 +33,10 @@ from .readings import (
     charger_reading,
     limits_of,
 )
-from .session import EwsBox
-from .status import PortStatus
 from .timing import COMMAND_MARGIN, COMMAND_TIMEOUT, TIMING
+from .wire.frames import LONGEST_FRAME
+from .wire.parameters import SystemMode
+from .wire.status import PortStatus
 
 _SOONER: Final = 1.0
 """A slow poll comes so much before the deadline, s."""

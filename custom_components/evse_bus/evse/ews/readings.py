@@ -8,10 +8,10 @@ from typing import Final
 
 from ..model import MINIMUM_CURRENT, Capability, Limits, SessionResult
 from ..readings import ChargerInfo, ChargerReading, ConnectorReading
-from .box import BoxStatus
-from .parameters import SystemMode
-from .session import Installation, Told
-from .states import (
+from .box import Installation, Told
+from .wire.box_status import BoxStatus
+from .wire.parameters import SystemMode
+from .wire.states import (
     AFTER_OUR_PAUSE,
     CHARGING,
     PAUSED_OPTIMISED,
@@ -19,7 +19,7 @@ from .states import (
     box_faults,
     port_state,
 )
-from .status import ChargeResult, PortFlags, PortStatus, StartRelease
+from .wire.status import ChargeResult, PortFlags, PortStatus, StartRelease
 
 MODE_1_CURRENT: Final = 16
 """What a household socket carries, A: all or nothing (2.2.1)."""

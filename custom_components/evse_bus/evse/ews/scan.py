@@ -16,8 +16,8 @@ from ..errors import (
 )
 from ..model import ChargerConfig, Orders
 from ..scan import FoundCharger, ScanResult
+from .box import EwsBox
 from .readings import charger_info, limits_of
-from .session import EwsBox
 
 if TYPE_CHECKING:
     from ..bus import Bus

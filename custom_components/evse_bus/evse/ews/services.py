@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Final
 from ..conversation import rest
 from ..errors import NotConfirmedError, RefusedOrderError, ReplyTimeoutError
 from ..exchange import Turn
-from .answers import decode_card_reader
-from .box import Dhcp, decode_dhcp
-from .cards import (
+from .timing import LOOK_AGAIN
+from .wire.answers import decode_card_reader
+from .wire.box_status import Dhcp, decode_dhcp
+from .wire.cards import (
     AcceptedCard,
     CardEntry,
     CardList,
@@ -21,16 +22,15 @@ from .cards import (
     decode_cards,
     write_cards,
 )
-from .commands import (
+from .wire.commands import (
     PortLeds,
     ReaderTarget,
     card_reader,
     set_leds,
     set_meter,
 )
-from .frames import CommandId, Request
-from .parameters import Block, Shown
-from .timing import LOOK_AGAIN
+from .wire.frames import CommandId, Request
+from .wire.parameters import Block, Shown
 
 if TYPE_CHECKING:
     from .reader import EwsReader

@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Final
 
 from ..framing import LineSettings, Timing
-from .frames import LONGEST_FRAME
+from .wire.frames import LONGEST_FRAME
 
 SETTINGS: Final = LineSettings(baudrate=115200)
 

@@ -14,11 +14,11 @@ from ..errors import NotAvailableError, NotConfirmedError, ReplyTimeoutError
 from ..exchange import Turn
 from ..model import MINIMUM_CURRENT, CurrentLimit, Fault, Orders
 from ..safety import Setpoint, clamp
-from .answers import EwsRefusedError
-from .commands import set_limit
-from .frames import CommandId, Request
-from .states import STARTING
 from .timing import LOOK_AGAIN, READY_PATIENCE, READY_PAUSE
+from .wire.answers import EwsRefusedError
+from .wire.commands import set_limit
+from .wire.frames import CommandId, Request
+from .wire.states import STARTING
 
 if TYPE_CHECKING:
     from .reader import EwsReader

@@ -10,9 +10,9 @@ from dataclasses import field
 from enum import IntEnum
 from typing import Final
 
-from ..errors import RefusedOrderError
-from ..fields import Number, Raw, Text
-from ..structs import Struct, coded, many, part, record
+from ...errors import RefusedOrderError
+from ...fields import Number, Raw, Text
+from ...structs import Struct, coded, many, part, record
 from .frames import CommandId, Request
 
 ENTRIES: Final = 64

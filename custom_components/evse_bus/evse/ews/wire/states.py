@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Final
 
-from ..errors import NotAvailableError
-from ..model import Fault, Status
-from .box import BoxFlags, BoxStatus
+from ...errors import NotAvailableError
+from ...model import Fault, Status
+from .box_status import BoxFlags, BoxStatus
 from .status import ChargeResult, PortStatus, StartRelease
 
 FREE: Final = 0x00

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from enum import KEEP, IntFlag
 from typing import Final
 
-from ..fields import Flags, Number
-from ..structs import Struct, coded, many, record
+from ...fields import Flags, Number
+from ...structs import Struct, coded, many, record
 from .frames import EwsFrame, MessageId
 
 _NAME: Final = "if"

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from enum import Enum, IntEnum, StrEnum
 from typing import ClassVar, Final, override
 
-from ..errors import RefusedOrderError
-from ..framing import Frame, Framer
+from ...errors import RefusedOrderError
+from ...framing import Frame, Framer
 
 STX: Final = 0x02
 STX_BYTE: Final = b"\x02"

@@ -16,18 +16,18 @@ import logging
 from math import inf
 from typing import Final
 
-from ..bus import Bus
-from ..errors import EvseError, LineError, PortBusyError, PortMissingError
-from ..exchange import Turn, Wire
-from ..framing import Frame
-from ..line import line_error
-from ..statistics import ChargerStatistics
-from ..throttle import LOSSES, LOSSES_WINDOW, RateLimiter
-from .accepted import AcceptedLine, Address, Connection
-from .charger import EwsPort
-from .frames import EwsFrame, EwsFramer, MessageId
-from .session import EwsBox, Ports
-from .timing import TCP_TIMING
+from ...bus import Bus
+from ...errors import EvseError, LineError, PortBusyError, PortMissingError
+from ...exchange import Turn, Wire
+from ...framing import Frame
+from ...line import line_error
+from ...statistics import ChargerStatistics
+from ...throttle import LOSSES, LOSSES_WINDOW, RateLimiter
+from ..box import EwsBox, Ports
+from ..charger import EwsPort
+from ..timing import TCP_TIMING
+from ..wire.frames import EwsFrame, EwsFramer, MessageId
+from .line import AcceptedLine, Address, Connection
 
 _LOGGER = logging.getLogger(__name__)
 

@@ -8,10 +8,10 @@ from datetime import datetime
 from enum import IntEnum
 from typing import Final
 
-from ..errors import RefusedOrderError
-from ..fields import Number
-from ..safety import Setpoint
-from ..structs import Struct, coded, pair, part, record
+from ...errors import RefusedOrderError
+from ...fields import Number
+from ...safety import Setpoint
+from ...structs import Struct, coded, pair, part, record
 from .fields import Moment
 from .frames import MAXIMUM_PARAMETERS, CommandId, Request
 from .states import StartStop, check_order, check_unlock

@@ -5,7 +5,7 @@ from datetime import date, datetime, time
 from ipaddress import IPv4Address
 from typing import Final, override
 
-from ..fields import Field, Text
+from ...fields import Field, Text
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

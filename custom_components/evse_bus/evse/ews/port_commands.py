@@ -21,13 +21,13 @@ from ..errors import (
 )
 from ..exchange import Turn
 from ..model import Capability, Command
-from .answers import decode_reset
-from .commands import reset, start_stop, unlock
-from .frames import CommandId, Request
 from .readings import RUNNING
-from .states import StartStop, unlocks
-from .status import PortStatus, StartRelease
 from .timing import LOOK_AGAIN, SETTLING
+from .wire.answers import decode_reset
+from .wire.commands import reset, start_stop, unlock
+from .wire.frames import CommandId, Request
+from .wire.states import StartStop, unlocks
+from .wire.status import PortStatus, StartRelease
 
 if TYPE_CHECKING:
     from .reader import EwsReader

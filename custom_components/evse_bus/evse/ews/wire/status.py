@@ -8,9 +8,9 @@ from datetime import datetime
 from enum import KEEP, IntEnum, IntFlag
 from typing import Final
 
-from ..errors import ImplausibleReplyError
-from ..fields import Field, Flag, Flags, Number, Text, Unused
-from ..structs import Struct, coded, optional, pair, record
+from ...errors import ImplausibleReplyError
+from ...fields import Field, Flag, Flags, Number, Text, Unused
+from ...structs import Struct, coded, optional, pair, record
 from .fields import Centivolts, Moment
 
 type Pair[V] = tuple[V, V]

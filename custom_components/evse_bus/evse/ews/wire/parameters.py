@@ -15,9 +15,9 @@ from enum import KEEP, Enum, IntEnum, IntFlag
 from ipaddress import IPv4Address
 from typing import Final
 
-from ..errors import RefusedOrderError
-from ..fields import Flag, Flags, Number, Raw, Text
-from ..structs import Struct, coded, record
+from ...errors import RefusedOrderError
+from ...fields import Flag, Flags, Number, Raw, Text
+from ...structs import Struct, coded, record
 from .fields import Address, Ascii
 from .frames import CommandId, Request
 

@@ -10,10 +10,10 @@ from ipaddress import IPv4Address, IPv6Address, ip_address
 import logging
 from typing import ClassVar, Final, override
 
-from ..errors import LineLostError, PortMissingError
-from ..line import Line
-from .frames import LONGEST_FRAME
-from .timing import SETTINGS
+from ...errors import LineLostError, PortMissingError
+from ...line import Line
+from ..timing import SETTINGS
+from ..wire.frames import LONGEST_FRAME
 
 _LOGGER = logging.getLogger(__name__)
 

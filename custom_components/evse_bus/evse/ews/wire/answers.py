@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from enum import StrEnum
 from typing import Final
 
-from ..errors import ExchangeRefusedError, ImplausibleReplyError
+from ...errors import ExchangeRefusedError, ImplausibleReplyError
 from .frames import Bcc, CommandId, EwsFrame
 
 OK: Final = 0

@@ -10,7 +10,7 @@ from custom_components.evse_bus.evse.errors import (
     NotConfirmedError,
     RefusedOrderError,
 )
-from custom_components.evse_bus.evse.ews.answers import EwsRefusedError
+from custom_components.evse_bus.evse.ews.wire.answers import EwsRefusedError
 from custom_components.evse_bus.evse.model import (
     Command,
     Fault,

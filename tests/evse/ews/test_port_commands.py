@@ -13,7 +13,7 @@ from custom_components.evse_bus.evse.errors import (
     NotConfirmedError,
     RefusedOrderError,
 )
-from custom_components.evse_bus.evse.ews import session
+from custom_components.evse_bus.evse.ews import box
 from custom_components.evse_bus.evse.ews.config import EwsPortConfig
 from custom_components.evse_bus.evse.model import (
     ChargerConfig,
@@ -35,7 +35,7 @@ def amperes(current: float) -> OrderChange:
 
 
 def test_the_clock_is_kept_right(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session, "CLOCK_PAUSE", 100.0)
+    monkeypatch.setattr(box, "CLOCK_PAUSE", 100.0)
     zone = ZoneInfo("Europe/Berlin")
     right = datetime(2026, 7, 1, 10, 0, tzinfo=UTC)
 

@@ -1,0 +1,1 @@
+"""EWS-Boxes that dial: the listener, and the line of each box."""

@@ -1,0 +1,1 @@
+"""Messages of the EWS-Box: frames, records, commands and answers; no conversations."""

@@ -1,0 +1,113 @@
+"""What an EWS-Box tells of itself as a whole: ``rs``, ``rg``.
+
+Source of the tables: manual, 3.2.4. Cards and the box's network are private: no repr
+shows them.
+"""
+
+from datetime import datetime
+from enum import KEEP, IntFlag
+from ipaddress import IPv4Address
+from typing import Final
+
+from ...fields import Flag, Flags, Number, Raw, Text
+from ...structs import Struct, coded, optional, record
+from .fields import Address, Identity, Moment
+
+_SUPPLY: Final = (0, *range(6, 81))
+"""A: not told, or from the lowest limit (3.1.8) to what a control pilot can offer."""
+
+
+# -- rs: the box -------------------------------------------------------------------
+
+
+class BoxFlags(IntFlag, boundary=KEEP):
+    """State of the box as a whole."""
+
+    RESTARTED = 1 << 0
+    LOCK_CONFIGURED = 1 << 1
+    BACKUP_PRESENT = 1 << 2
+    BACKUP_CHARGED = 1 << 3
+    BACKUP_TIMEOUT = 1 << 4
+
+
+@record
+class PresentedCard:
+    """A card at the reader."""
+
+    tag: bytes = coded(Raw(width=7), secret=True)
+    """Number of the tag, 7 bytes."""
+    valid: bool = coded(Flag())
+    """The box's own list knows it. Means nothing over Ethernet: always yes there."""
+    decode_error: int = coded(Number(width=1))
+    """0: it could be read."""
+    group: int = coded(Number(width=2), secret=True)
+    number: int = coded(Number(width=2), secret=True)
+    """Within its group."""
+    user: str = coded(Text(width=8), secret=True)
+
+
+PRESENTED_CARD: Final = Struct(PresentedCard, "3.2.4 rs: card")
+
+
+@record
+class BoxStatus:
+    """What ``rs`` tells of the box."""
+
+    firmware: str = coded(Text(width=11))
+    flags: BoxFlags = coded(Flags(kind=BoxFlags))
+    serial: str = coded(Identity(width=12))
+    website_size: int = coded(Number(width=4, unit="bytes"))
+    """Bytes."""
+    website_crc: int = coded(Number(width=2))
+    website_version: str = coded(Text(width=20))
+    lan_error: int = coded(Number(width=1))
+    """Of the LAN chip when it was started; 0: none."""
+    mac: bytes = coded(Raw(width=6), secret=True)
+    server_connected: bool = coded(Flag())
+    web_client: IPv4Address = coded(Address(), secret=True)
+    """Who looks at the box's web page."""
+    maximum_current: int = coded(Number(width=1, unit="A", possible=_SUPPLY))
+    """Highest charging current or fuse of the box, A; 0: not told (yet)."""
+    ventilating: bool = coded(Flag())
+    clock: datetime | None = coded(Moment())
+    """In the box's time zone; ``None``: not set."""
+    reader_error: int = coded(Number(width=1))
+    """Of the card reader when it was started; 0: found and right."""
+    reader_firmware: str = coded(Text(width=11))
+    card: PresentedCard | None = coded(optional(PRESENTED_CARD), secret=True)
+    """At the reader now."""
+
+
+BOX: Final = Struct(BoxStatus, "3.2.4 rs")
+
+
+def decode_box(data: bytes) -> BoxStatus:
+    """Return what the answer to ``rs`` says; raises ImplausibleReplyError."""
+    return BOX.decode(data)
+
+
+# -- rg: what DHCP gave ------------------------------------------------------------
+
+
+@record
+class Dhcp:
+    """What ``rg`` tells of a box with DHCP."""
+
+    address: IPv4Address = coded(Address(), secret=True)
+    gateway: IPv4Address = coded(Address(), secret=True)
+    netmask: IPv4Address = coded(Address(), secret=True)
+    server: IPv4Address = coded(Address(), secret=True)
+    """Its "logical" address."""
+    server_real: IPv4Address = coded(Address(), secret=True)
+    lease: int = coded(Number(width=4, unit="s"))
+    """s; 0: for ever."""
+    lease_left: int = coded(Number(width=4, unit="s"))
+    """s; the connection is dropped at half the lease."""
+
+
+DHCP: Final = Struct(Dhcp, "3.2.4 rg")
+
+
+def decode_dhcp(data: bytes) -> Dhcp:
+    """Return what the answer to ``rg`` says; raises ImplausibleReplyError."""
+    return DHCP.decode(data)
