@@ -189,7 +189,7 @@ async def run(code: str, *arguments: str) -> str:
 async def test_the_script_of_the_library_reads_and_sets_a_charger() -> None:
     code = scripts("docs/library.md")[0]
     lines = [line for line in code.splitlines() if line.strip()]
-    assert len(lines) == 12
+    assert len(lines) == 11
     car = Car(max_current=16)
     box = AblBox(1, car=car)
     async with VirtualBus.pty(box) as bus:

@@ -1,6 +1,98 @@
-"""EV chargers on serial buses, without Home Assistant.
+"""EV chargers on a serial bus: EVBox, ABL, SmartEVSE and P-CHARGE EWS-Box.
 
-Public: `protocols.PROTOCOLS` (how to make a bus of each protocol and find its
-chargers), `bus.Bus`, `charger.Charger`, and the words of `model`. ``docs/library.md``
-has a short script that reads and sets a charger.
+A library of its own: it imports nothing of Home Assistant. The names below are what a
+script needs; docs/library.md has examples.
 """
+
+from .bus import Bus
+from .charger import Charger
+from .conversation import rest
+from .errors import (
+    DuplicateAddressError,
+    EvseError,
+    ExchangeError,
+    ExchangeRefusedError,
+    GarbledReplyError,
+    ImplausibleReplyError,
+    LineBusyError,
+    LineError,
+    LineLostError,
+    NotAvailableError,
+    NotConfirmedError,
+    PortBusyError,
+    PortMissingError,
+    PortPermissionError,
+    PortSettingsError,
+    RefusedOrderError,
+    ReplyTimeoutError,
+    SharedAddressError,
+    SupersededError,
+    WrongChargerError,
+)
+from .exchange import Turn
+from .framing import LineSettings
+from .model import (
+    Capability,
+    ChargerConfig,
+    Command,
+    CurrentLimit,
+    Fault,
+    Limits,
+    Mode,
+    OrderChange,
+    Orders,
+    SessionResult,
+    Setting,
+    Status,
+)
+from .protocol import Protocol
+from .protocols import PROTOCOLS
+from .readings import ChargerInfo, ChargerReading, ConnectorReading
+from .scan import FoundCharger, ScanResult
+
+__all__ = [
+    "PROTOCOLS",
+    "Bus",
+    "Capability",
+    "Charger",
+    "ChargerConfig",
+    "ChargerInfo",
+    "ChargerReading",
+    "Command",
+    "ConnectorReading",
+    "CurrentLimit",
+    "DuplicateAddressError",
+    "EvseError",
+    "ExchangeError",
+    "ExchangeRefusedError",
+    "Fault",
+    "FoundCharger",
+    "GarbledReplyError",
+    "ImplausibleReplyError",
+    "Limits",
+    "LineBusyError",
+    "LineError",
+    "LineLostError",
+    "LineSettings",
+    "Mode",
+    "NotAvailableError",
+    "NotConfirmedError",
+    "OrderChange",
+    "Orders",
+    "PortBusyError",
+    "PortMissingError",
+    "PortPermissionError",
+    "PortSettingsError",
+    "Protocol",
+    "RefusedOrderError",
+    "ReplyTimeoutError",
+    "ScanResult",
+    "SessionResult",
+    "Setting",
+    "SharedAddressError",
+    "Status",
+    "SupersededError",
+    "Turn",
+    "WrongChargerError",
+    "rest",
+]

@@ -1,11 +1,11 @@
-"""What this library raises on purpose.
+"""The errors that this library raises on purpose.
 
 This module imports nothing of the project and nothing of Home Assistant.
 """
 
 
 class EvseError(Exception):
-    """Anything that this library raises on purpose."""
+    """Base class of all errors that this library raises on purpose."""
 
 
 class LineError(EvseError):
@@ -21,11 +21,11 @@ class PortBusyError(LineError):
 
 
 class PortPermissionError(LineError):
-    """The port exists, and we may not open it."""
+    """The port exists, but its permissions forbid opening it."""
 
 
 class PortSettingsError(LineError):
-    """The port or its URL does not take these settings."""
+    """The port or its URL does not support these settings."""
 
 
 class LineLostError(LineError):
@@ -33,23 +33,23 @@ class LineLostError(LineError):
 
 
 class LineBusyError(LineError):
-    """Others kept talking: no silence to speak in."""
+    """The line was never quiet for long enough to send."""
 
 
 class ExchangeError(EvseError):
-    """A request did not get a good answer."""
+    """A request did not get a good reply."""
 
 
 class ReplyTimeoutError(ExchangeError):
-    """Nobody answered in time."""
+    """No reply came in time."""
 
 
 class GarbledReplyError(ReplyTimeoutError):
-    """Something answered, and no good frame could be made of it."""
+    """Bytes came in reply, but no good frame."""
 
 
 class ExchangeRefusedError(ExchangeError):
-    """The charger answered that it will not."""
+    """The charger refused the request."""
 
     def __init__(self, message: str, code: int | None = None) -> None:
         """Keep the charger's own code beside the message."""
@@ -58,7 +58,7 @@ class ExchangeRefusedError(ExchangeError):
 
 
 class ImplausibleReplyError(ExchangeError):
-    """A frame with good checksums that says what cannot be; held back."""
+    """A frame with good checksums and impossible content; not used."""
 
 
 class WrongChargerError(EvseError):
@@ -76,11 +76,11 @@ class DuplicateAddressError(EvseError):
 
 
 class SharedAddressError(DuplicateAddressError):
-    """Others on the bus hear what is said to this charger; nothing was written."""
+    """Other chargers obey requests to this address too; nothing was written."""
 
 
 class NotConfirmedError(EvseError):
-    """A command was sent and the charger never confirmed it."""
+    """A command was sent, but the charger did not confirm it."""
 
 
 class SupersededError(EvseError):
@@ -88,7 +88,7 @@ class SupersededError(EvseError):
 
 
 class RefusedOrderError(EvseError, ValueError):
-    """A wish that is not a usable number, or out of what may be asked."""
+    """A requested value that is not a usable number, or out of range."""
 
 
 class NotAvailableError(EvseError):

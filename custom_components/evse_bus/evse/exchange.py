@@ -1,6 +1,6 @@
-"""One exchange on a line: silence, request, answer, time-out.
+"""One exchange on a line: silence, request, reply, time-out.
 
-Frames that answer nothing are handed on, or counted as other people's.
+A frame that matches no request is passed on as unsolicited, or counted as foreign.
 """
 
 import asyncio
@@ -24,42 +24,42 @@ _BASE_REQUEST: Final = 64
 
 
 type Request = bytes | Callable[[], bytes]
-"""What to send; a function is asked when the line is quiet, right before it goes."""
+"""Bytes to send, or a function that returns them, called right before they are sent."""
 
 
 class Wire:
     """A line with frames on it; one exchange at a time."""
 
     def __init__(self, line: Line, framer: Framer[Frame], timing: Timing) -> None:
-        """Listen to a line; `Line.open` is the caller's."""
+        """Receive from a line; its caller opens it."""
         self.line = line
         self.timing = timing
         self.statistics = BusStatistics()
         self.frames = FrameLog()
         self.on_unsolicited: Callable[[Frame], bool] = lambda _frame: False
-        """Called with a good frame that is no answer; returns whether it was ours."""
+        """Called with a good frame that is no reply; returns whether it was used."""
         self.sent_at: float | None = None
-        """Loop time at which the last request had left; ``None``: it did not."""
+        """Loop time at which the last request had been sent, s; ``None``: it was not."""
         self._framer = framer
-        self._heard_at = -inf
+        self._received_at = -inf
         self._pending: _PendingReply | None = None
         line.on_data = self._on_data
 
     def exchange_time(self, request_bytes: int = _BASE_REQUEST) -> float:
         """Return the longest time an exchange can take, time-out included, s."""
         timing = self.timing
-        # Where silence is asked for, others may keep us waiting for it.
+        # Where silence is required, other masters may delay it.
         silence = timing.silence_patience if timing.silence else 0.0
         wire = (request_bytes + timing.longest_reply) * self.line.settings.byte_time
         return silence + wire + timing.reply_timeout + timing.gap
 
     def send_time(self, request_bytes: int) -> float:
-        """Return the longest time it can take to send what nobody answers, s."""
+        """Return the longest time that sending without a reply can take, s."""
         silence = self.timing.silence_patience if self.timing.silence else 0.0
         return silence + request_bytes * self.line.settings.byte_time
 
     def reset(self) -> None:
-        """Forget a frame begun: the line was opened anew."""
+        """Drop an incomplete frame: the line was opened anew."""
         self._framer.reset()
 
     def fail(self, error: LineLostError) -> None:
@@ -76,12 +76,12 @@ class Wire:
         reply_may_equal: bool = False,
         patience: float = 0.0,
     ) -> T:
-        """Send a request and wait for its answer (see `Turn.exchange`)."""
+        """Send a request and wait for its reply (see `Turn.exchange`)."""
         self.sent_at = None
         await self._silence()
         data = request() if callable(request) else request
         loop = asyncio.get_running_loop()
-        self._forget_what_has_begun()
+        self._drop_incomplete_frame()
         bad, noise = self._framer.bad, self._framer.noise
         started = loop.time()
         sent = self.line.write(data, reply_may_equal=reply_may_equal)
@@ -93,7 +93,7 @@ class Wire:
             gap=self.timing.gap,
         )
         self._pending = pending
-        self.frames.add(Direction.OUT, self._framer.shown(data))
+        self.frames.add(Direction.OUT, self._framer.redacted(data))
         self.statistics.requests += 1
         counted.requests += 1
         try:
@@ -105,7 +105,7 @@ class Wire:
             unreadable = self._framer.bad - bad
             if unreadable or self._framer.noise > noise:
                 counted.bad_frames += max(unreadable, 1)
-                message = "an answer came, but it could not be read"
+                message = "a reply came, but it could not be read"
                 raise GarbledReplyError(message) from error
             raise
         finally:
@@ -116,27 +116,27 @@ class Wire:
                 self.statistics.replies += 1
                 counted.reply(pending.answered_at - started)
         if not self.line.is_open:
-            # Lost in the same breath: nothing may go on from here.
+            # Lost together with the reply: the conversation must not go on.
             message = f"{self.line.url} was lost"
             raise LineLostError(message)
         return result  # type: ignore[return-value] # accept's own type
 
     async def send(self, request: Request) -> float:
-        """Send what nobody answers (see `Turn.send`)."""
+        """Send without waiting for a reply (see `Turn.send`)."""
         self.sent_at = None
         await self._silence()
         data = request() if callable(request) else request
-        self._forget_what_has_begun()
+        self._drop_incomplete_frame()
         sent = self.line.write(data)
         self.sent_at = sent
-        self.frames.add(Direction.OUT, self._framer.shown(data))
+        self.frames.add(Direction.OUT, self._framer.redacted(data))
         self.statistics.sent_only += 1
-        # The line is ours until the last byte has left.
+        # The line is in use until the last byte has been sent.
         await asyncio.sleep(sent - asyncio.get_running_loop().time())
         return sent
 
     async def _silence(self) -> None:
-        """Wait until the line has been quiet for as long as the protocol asks."""
+        """Wait until the line has been quiet for as long as the protocol requires."""
         loop = asyncio.get_running_loop()
         patience = loop.time() + self.timing.silence_patience
         while True:
@@ -145,34 +145,34 @@ class Wire:
             if wait <= 0:
                 return
             if now + wait > patience:
-                message = "others keep talking, there is no silence to speak in"
+                message = "the line is never quiet for long enough to send"
                 raise LineBusyError(message)
             await asyncio.sleep(wait)
 
-    def _forget_what_has_begun(self) -> None:
-        """Forget a frame begun before we speak, but for one that may be unasked.
+    def _drop_incomplete_frame(self) -> None:
+        """Drop a frame that has not ended before a request, unless it is unsolicited.
 
-        A serial port gives it in lumps, and what it tells is told once.
+        Serial ports deliver such a frame in chunks, and it is sent only once.
         """
         now = asyncio.get_running_loop().time()
-        if not self._framer.unasked or now - self._heard_at > self.timing.gap:
+        if not self._framer.unsolicited or now - self._received_at > self.timing.gap:
             self._framer.reset()
 
     def _on_data(self, data: bytes) -> None:
-        self._heard_at = asyncio.get_running_loop().time()
+        self._received_at = asyncio.get_running_loop().time()
         framer = self._framer
         bad, noise = framer.bad, framer.noise
         frames = framer.feed(data)
         if framer.bad > bad or framer.noise > noise:
             self.statistics.bad_frames += framer.bad - bad
             self.statistics.noise_bytes += framer.noise - noise
-            self.frames.add(Direction.UNREADABLE, framer.shown(data))
+            self.frames.add(Direction.UNREADABLE, framer.redacted(data))
         for frame in frames:
             self.statistics.frames += 1
-            self.frames.add(Direction.IN, framer.shown(frame.raw))
+            self.frames.add(Direction.IN, framer.redacted(frame.raw))
             self._on_frame(frame)
         if self._pending is not None and framer.pending:
-            self._pending.goes_on()
+            self._pending.extend()
 
     def _on_frame(self, frame: Frame) -> None:
         if self._pending is not None and self._pending.offer(frame):
@@ -184,10 +184,10 @@ class Wire:
 
 
 class Turn:
-    """What a conversation may do in its turn: exchanges, one after the other."""
+    """The turn of a conversation: exchanges, one after the other."""
 
     def __init__(self, wire: Wire, counted: ChargerStatistics) -> None:
-        """Count what is said under one charger's name."""
+        """Count its exchanges in the statistics of one charger."""
         self._wire = wire
         self._counted = counted
 
@@ -198,9 +198,9 @@ class Turn:
 
     @property
     def sent_at(self) -> float | None:
-        """Return the loop time at which our last request had left, s.
+        """Return the loop time at which the last request had been sent, s.
 
-        ``None``: it was not sent (no silence to speak in, or the line was lost).
+        ``None``: it was not sent (the line was never quiet, or was lost).
         """
         return self._wire.sent_at
 
@@ -212,16 +212,16 @@ class Turn:
         reply_may_equal: bool = False,
         patience: float = 0.0,
     ) -> T:
-        """Send a request and return what ``accept`` makes of its answer.
+        """Send a request and return the result of ``accept`` for its reply.
 
-        A request that is an order is given as a function: an order lowered while
-        we wait for silence must not be overtaken by the one before it.
+        A request that carries an order is a function: an order lowered while the line
+        is not quiet must not be overtaken by the one before it.
 
-        ``accept`` sees every good frame that comes: it returns ``None`` for one
-        that is not the answer, and raises for an answer that says no.
+        ``accept`` gets every good frame: it returns ``None`` for one that is not the
+        reply, and raises for a refusal.
 
-        ``patience`` is added to the reply time-out, s: the turn must have been given
-        the time for it (`FollowUp.worst_case`).
+        ``patience`` is added to the reply time-out, s: the worst case of the turn must
+        include it (see `rest`).
 
         Raises ReplyTimeoutError, GarbledReplyError, LineBusyError, LineLostError
         and what ``accept`` raises.
@@ -235,17 +235,16 @@ class Turn:
         )
 
     async def send(self, request: Request) -> float:
-        """Send what nobody answers; return the loop time at which it had left.
+        """Send without waiting for a reply; return the loop time of the end, s.
 
-        For a broadcast and for the answer to somebody's request. A function is asked
-        for the bytes when the line is quiet, right before they go. Raises
+        For a broadcast, and for the reply to a request of a charger. Raises
         LineBusyError and LineLostError.
         """
         return await self._wire.send(request)
 
 
 class _PendingReply:
-    """The wait for one answer: until the first byte, then for as long as they come."""
+    """The wait for one reply: for its first byte, then for as long as bytes come."""
 
     def __init__(
         self,
@@ -261,18 +260,18 @@ class _PendingReply:
         self._accept = accept
         self._gap = gap
         self._first_byte_by = first_byte_by
-        self._heard_at = -inf
-        # Noise that never ends must not hold the bus: this is the worst case.
+        self._received_at = -inf
+        # Endless noise must not hold the bus: this is the worst case.
         self._last_chance = first_byte_by + longest + gap
         self._timer = self._loop.call_at(first_byte_by, self._time_is_up)
 
     def offer(self, frame: Frame) -> bool:
-        """Return whether this frame was the answer."""
+        """Return whether this frame was the reply."""
         if self.future.done():
             return False
         try:
             result = self._accept(frame)
-        except Exception as error:  # noqa: BLE001 - it must reach whoever asked
+        except Exception as error:  # noqa: BLE001 - it is for the caller
             self.future.set_exception(error)
         else:
             if result is None:
@@ -281,24 +280,24 @@ class _PendingReply:
         self.answered_at = self._loop.time()
         return True
 
-    def goes_on(self) -> None:
-        """Give a frame that has begun the time to end."""
-        self._heard_at = self._loop.time()
+    def extend(self) -> None:
+        """Give an incomplete frame the time to end."""
+        self._received_at = self._loop.time()
 
     def fail(self, error: EvseError) -> None:
-        """End the wait without an answer."""
+        """End the wait without a reply."""
         if not self.future.done():
             self.future.set_exception(error)
 
     def _time_is_up(self) -> None:
         if self.future.done():
             return
-        until = max(self._first_byte_by, self._heard_at + self._gap)
+        until = max(self._first_byte_by, self._received_at + self._gap)
         until = min(until, self._last_chance)
         if until > self._loop.time():
             self._timer = self._loop.call_at(until, self._time_is_up)
             return
-        self.future.set_exception(ReplyTimeoutError("no answer in time"))
+        self.future.set_exception(ReplyTimeoutError("no reply in time"))
 
     def close(self) -> None:
         """Leave no timer behind."""

@@ -1,4 +1,4 @@
-"""What a protocol tells the bus about its frames and its times."""
+"""Line settings, times and frames of a protocol, as the bus needs them."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ from typing import ClassVar
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LineSettings:
-    """How bytes look on the wire; fixed by the protocol."""
+    """Coding of bytes on the wire; fixed by the protocol."""
 
     baudrate: int
     parity: str = "N"
@@ -31,21 +31,21 @@ class Timing:
     """A protocol's numbers for the bus, all in seconds unless named otherwise."""
 
     silence: float = 0.0
-    """How long the line must have been quiet before we speak."""
+    """Quiet time of the line required before a request."""
     silence_patience: float = 2.0
-    """How long to wait for that quiet before giving up."""
+    """Longest wait for that quiet time."""
     reply_timeout: float
-    """From the end of a request to the first byte of its answer."""
+    """From the end of a request to the first byte of its reply."""
     gap: float = 0.1
-    """Longest pause inside an answer (adapters deliver in lumps)."""
+    """Longest pause inside a reply (adapters deliver in chunks)."""
     longest_reply: int
     """Bytes; with ``reply_timeout`` it makes an exchange's worst case."""
     retry_pauses: tuple[float, ...] = (0.6, 2.0)
-    """Pause after the first, second, ... request in a row left unanswered."""
+    """Pause after the first, second, ... unanswered request in a row."""
     misses: int = 3
-    """Requests in a row left unanswered until a charger counts as gone."""
+    """Unanswered requests in a row after which a charger is unavailable."""
     backoff: float = 4.0
-    """First pause between two tries to find a charger that is gone; doubles."""
+    """First pause between two probes of an unavailable charger; doubles."""
     backoff_limit: float = 30.0
     """Longest such pause."""
     attempts: int = 3
@@ -62,13 +62,13 @@ class Frame(ABC):
 
 
 class Framer[F: Frame](ABC):
-    """Finds frames in a stream of bytes; keeps what is left for the next call."""
+    """Finds frames in a stream of bytes; keeps an incomplete one for the next call."""
 
-    unasked: ClassVar[bool] = False
-    """Frames come at any moment, also while we begin to speak."""
+    unsolicited: ClassVar[bool] = False
+    """Frames may come at any moment, also right before a request."""
 
     def __init__(self) -> None:
-        """Start with nothing heard."""
+        """Start without a frame."""
         self.noise = 0
         """Bytes that belong to no frame."""
         self.bad = 0
@@ -76,17 +76,17 @@ class Framer[F: Frame](ABC):
 
     @abstractmethod
     def feed(self, data: bytes) -> Sequence[F]:
-        """Return the whole frames that end within these bytes."""
+        """Return the complete frames that end within these bytes."""
 
     @abstractmethod
     def reset(self) -> None:
-        """Forget a frame begun; its bytes count as noise."""
+        """Drop an incomplete frame; its bytes count as noise."""
 
     @property
     @abstractmethod
     def pending(self) -> int:
-        """Return the number of bytes of a frame begun and not ended."""
+        """Return the number of bytes of an incomplete frame."""
 
-    def shown(self, raw: bytes) -> bytes:
-        """Return bytes that passed as they may stand in a log: nothing private."""
+    def redacted(self, raw: bytes) -> bytes:
+        """Return received or sent bytes as they may be logged, without private data."""
         return raw

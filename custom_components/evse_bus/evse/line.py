@@ -1,8 +1,8 @@
 """One serial line or socket: bytes out, bytes in, silence, echo.
 
-The line knows nothing of frames. It opens and closes one serialx connection,
-says in typed errors why it cannot, and strips the echo of our own bytes where
-the adapter hears itself (common on two-wire RS-485).
+The line knows no frames. It opens and closes one serialx connection, raises typed
+errors where it cannot, and strips the echo of our own bytes where the adapter receives
+its own transmission (common on two-wire RS-485).
 """
 
 import asyncio
@@ -56,7 +56,7 @@ _ERRORS: dict[int, type[LineError]] = {
 
 
 def line_error(error: Exception) -> LineError:
-    """Return why a port cannot be used, as one of our typed errors."""
+    """Return the typed error for an exception of the port."""
     # Order matters: a name that does not resolve and a time-out are OSErrors too.
     if isinstance(error, (TimeoutError, ConnectionError, socket.gaierror)):
         return PortMissingError(str(error) or type(error).__name__)
@@ -70,7 +70,7 @@ def line_error(error: Exception) -> LineError:
 
 @dataclass(slots=True)
 class LineStatistics:
-    """What went over a line since it was made; survives reopening."""
+    """Traffic of a line since it was created; survives reopening."""
 
     bytes_out: int = 0
     bytes_in: int = 0
@@ -83,21 +83,21 @@ class Line:
     """One serialx connection, half duplex."""
 
     opened_by_peer: ClassVar[bool] = False
-    """The other end opens it: that it has not yet is no error, and a wait is all."""
+    """The other end opens it: a line that is not open yet is no error."""
 
     def __init__(self, url: str, settings: LineSettings) -> None:
-        """Remember where and how; nothing is opened yet."""
+        """Set URL and line settings; nothing is opened yet."""
         self.url = url
         self.settings = settings
         self.statistics = LineStatistics()
         self.on_data: Callable[[bytes], None] = lambda _data: None
-        """Called with received bytes, echo already taken out."""
+        """Called with received bytes, without the echo."""
         self.on_lost: Callable[[LineLostError], None] = lambda _error: None
         """Called once when an open line is gone."""
         self.last_activity = 0.0
         """Loop time at which the last byte passed, in or out."""
         self.echoes: bool | None = None
-        """Whether the adapter hears itself; ``None`` until seen."""
+        """Whether the adapter echoes our own bytes; ``None``: not known yet."""
         self._transport: BaseSerialTransport | None = None
         self._echo = b""
         self._held = 0
@@ -135,7 +135,7 @@ class Line:
         self.last_activity = loop.time()
 
     async def close(self) -> None:
-        """Close the port; closing one that is gone is no error."""
+        """Close the port; no error if it is gone."""
         transport, self._transport = self._transport, None
         if transport is None:
             return
@@ -148,9 +148,9 @@ class Line:
     def write(self, data: bytes, *, reply_may_equal: bool = False) -> float:
         """Send bytes; return the loop time at which the last one has left.
 
-        ``reply_may_equal`` says that an answer may be the same bytes (a Modbus
-        RTU write): then an echo is taken out only if the adapter is known to make
-        one. Raises LineLostError when the line is not open.
+        ``reply_may_equal``: the reply may be the same bytes (a Modbus RTU write), so
+        an echo is stripped only if the adapter is known to make one. Raises
+        LineLostError when the line is not open.
         """
         if self._transport is None:
             message = f"{self.url} is not open"
@@ -177,11 +177,11 @@ class Line:
             self.on_data(data)
 
     def _strip_echo(self, data: bytes) -> bytes:
-        """Take our own bytes off the front, or give back all that was held."""
+        """Strip our own bytes from the front; return everything where they differ."""
         rest = self._echo[self._held :]
         length = min(len(rest), len(data))
         if rest[:length] != data[:length]:
-            # Not an echo after all (or a damaged one): let the framer see it all.
+            # Not an echo after all, or a damaged one: the framer gets all of it.
             held = self._echo[: self._held]
             self._echo = b""
             return held + data
@@ -194,7 +194,7 @@ class Line:
         return data[length:]
 
     def answered(self) -> None:
-        """Note that an answer came: an adapter that had not echoed will not."""
+        """Take note of a reply: an adapter that has not echoed by now does not."""
         if self.echoes is None:
             self.echoes = False
         self._echo = b""
@@ -208,7 +208,7 @@ class Line:
 
 
 class _Receiver(asyncio.Protocol):
-    """Hands what serialx says to the line."""
+    """Passes the events of serialx to the line."""
 
     def __init__(self, line: Line) -> None:
         self._line = line

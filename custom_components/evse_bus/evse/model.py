@@ -1,8 +1,7 @@
-"""The words every part shares: orders, limits, commands, and how one is set up.
+"""The vocabulary of all parts: orders, limits, commands, configuration.
 
-Units throughout: ampere, volt, watt, watt-hour, second. ``None`` means "not
-told": no value is made up for what the wire does not say, and 0 is only ever a
-measured 0.
+Units throughout: ampere, volt, watt, watt-hour, second. ``None`` means "not known":
+no value is made up for what is not on the wire, and 0 is always a measured 0.
 
 This module imports nothing of the project and nothing of Home Assistant.
 """
@@ -23,7 +22,7 @@ UNKNOWN_PHASES: Phases[float | None] = (None, None, None)
 
 
 class Status(StrEnum):
-    """State of a connector, in the words of OCPP 1.6."""
+    """Status of a connector, as in OCPP 1.6."""
 
     AVAILABLE = "available"
     PREPARING = "preparing"
@@ -36,9 +35,9 @@ class Status(StrEnum):
 
 
 class Fault(StrEnum):
-    """A named fault of a charger, or one that this library noticed itself."""
+    """A fault that a charger reports, or that this library has found."""
 
-    # Told by the charger (names after ABL EVCC2/3, annex 3.4 and register 0x06).
+    # Reported by the charger (names after ABL EVCC2/3, annex 3.4 and register 0x06).
     CONTACTOR_WELDED = "contactor_welded"
     CONTACTOR_OPEN = "contactor_open"
     INTERNAL = "internal"
@@ -54,24 +53,24 @@ class Fault(StrEnum):
     METER = "meter"
     REDUCED_CURRENT = "reduced_current"
     UNKNOWN = "unknown"
-    # Told by a SmartEVSE, in its own words (README of v2, register 0xA1).
+    # Reported by a SmartEVSE, under its own names (README of v2, register 0xA1).
     LESS_6A = "less_6a"
     """Less than 6 A is left for it: it waits."""
     NO_COMM = "no_comm"
-    """Nothing heard of its master or its meter for 10 s: it has stopped."""
+    """No message from its master or its meter for 10 s: it has stopped."""
     TEMP_HIGH = "temp_high"
     NO_CURRENT = "no_current"
     """Its master had no current for it: it waits for a minute."""
     RCD = "rcd"
     NO_SUN = "no_sun"
-    # Told by a P-CHARGE EWS-Box (manual, 3.2.4: status byte and last result of rc).
+    # Reported by a P-CHARGE EWS-Box (manual, 3.2.4: status byte and last result of rc).
     SOCKET_UNLOCK = "socket_unlock"
     """The plug cannot be unlocked."""
     CONFIGURATION = "configuration"
     CARD_READER = "card_reader"
     CABLE_LOST = "cable_lost"
     """The contact of the cable was lost while charging."""
-    # Noticed by us.
+    # Found by this library.
     UNSUPPORTED_FIRMWARE = "unsupported_firmware"
     SECOND_MASTER = "second_master"
     LIMIT_EXCEEDED = "limit_exceeded"
@@ -80,7 +79,7 @@ class Fault(StrEnum):
     DUPLICATE_ADDRESS = "duplicate_address"
     IMPLAUSIBLE = "implausible"
     NO_SUCH_PORT = "no_such_port"
-    """The box has fewer ports than it is set up with."""
+    """The box has fewer ports than are configured."""
 
 
 class SessionResult(StrEnum):
@@ -99,7 +98,7 @@ class SessionResult(StrEnum):
 
 
 class Capability(StrEnum):
-    """Something that a charger has; an entity exists only for a capability."""
+    """A feature of a charger; an entity exists only for a capability."""
 
     STATUS = "status"
     RAW_STATE = "raw_state"
@@ -139,16 +138,16 @@ class Capability(StrEnum):
     PILOT_VOLTAGE = "pilot_voltage"
     CARDS = "cards"
     KEYS = "keys"
-    """Its keys are told as they are pressed."""
+    """It reports each press of a key."""
     SERVER = "server"
-    """It says whether it is connected to its server."""
+    """It reports whether it is connected to its server."""
 
 
 class Persistence(StrEnum):
-    """How often a command may be sent for one wish."""
+    """How often a command may be sent for one request of the user."""
 
     STANDING = "standing"
-    """Asserted again until it is read back, and for as long as it stands."""
+    """Sent again until it is read back, and for as long as it stands."""
     REPEATABLE = "repeatable"
     """Sending it twice does the same as sending it once."""
     ONCE = "once"
@@ -156,7 +155,7 @@ class Persistence(StrEnum):
 
 
 class Command(StrEnum):
-    """Something a charger can be told beside its orders."""
+    """A command to a charger beside its orders."""
 
     RESET = "reset"
     WAKE = "wake"
@@ -182,18 +181,18 @@ class Command(StrEnum):
 
 
 class Mode(StrEnum):
-    """What decides how much a charger offers (SmartEVSE, register 0xA8)."""
+    """What determines the current that a charger offers (SmartEVSE, register 0xA8)."""
 
     NORMAL = "normal"
     """The limit alone."""
     SMART = "smart"
-    """What its own meter leaves of the mains connection."""
+    """The rest of the mains connection, by its own meter."""
     SOLAR = "solar"
-    """What its own meter says that the sun leaves over."""
+    """The solar surplus, by its own meter."""
 
 
 class Setting(StrEnum):
-    """Something a charger keeps in its own memory; set rarely, it wears out."""
+    """A setting in the own memory of a charger; written rarely, since it wears out."""
 
     MINIMUM_CURRENT = "minimum_current"
     """A car is not offered less, A."""
@@ -215,20 +214,20 @@ class Setting(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Range:
-    """From where to where something can be set, both included."""
+    """The range of a setting, both ends included."""
 
     minimum: int
     maximum: int
 
 
-# -- What the user wants to stand ------------------------------------------------
+# -- Orders ----------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CurrentLimit:
-    """A wish for a current: a total and, where the protocol has them, phases.
+    """A limit of the current: a total and, where the protocol has them, phases.
 
-    The wish for a phase is ``min(current, phases[n])``.
+    The limit of a phase is ``min(current, phases[n])``.
     """
 
     current: float
@@ -237,7 +236,7 @@ class CurrentLimit:
     """For one phase, A; ``None``: only ``current`` counts."""
 
     def effective(self) -> Phases[float]:
-        """Return the wish for L1, L2 and L3, A."""
+        """Return the limits of L1, L2 and L3, A."""
         one, two, three = (
             self.current if phase is None else min(self.current, phase)
             for phase in self.phases
@@ -247,17 +246,17 @@ class CurrentLimit:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Orders:
-    """What the user wants to stand for one charger. Never filled from a reading."""
+    """The orders of the user for one charger. Never filled from a reading."""
 
     limit: CurrentLimit
     allowed: bool | None = None
-    """May charge; ``None``: nobody has said so or not, the charger decides."""
+    """May charge; ``None``: not set by the user, the charger decides."""
     fail_safe: CurrentLimit = field(
         default_factory=lambda: CurrentLimit(current=MINIMUM_CURRENT)
     )
-    """What the charger falls back to when we fall silent; any value from 0."""
+    """Limit that the charger falls back to without messages; any value from 0."""
     fail_safe_timeout: int = 60
-    """Silence after which it does so, s (EVBox only)."""
+    """Time without messages after which it falls back, s (EVBox only)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -290,12 +289,12 @@ class OrderChange:
 
     @property
     def is_about_now(self) -> bool:
-        """Return whether it says how to charge now, not just the fail-safe."""
-        said = (self.allowed, self.current, *self.phases)
-        return any(value is not None for value in said)
+        """Return whether it changes how to charge now, not just the fail-safe."""
+        values = (self.allowed, self.current, *self.phases)
+        return any(value is not None for value in values)
 
     def merged_with(self, newer: OrderChange) -> OrderChange:
-        """Return both changes as one; the newer wins where both speak."""
+        """Return both changes as one; the newer counts where both set a value."""
         merged = {
             item.name: (
                 getattr(self, item.name)
@@ -329,18 +328,18 @@ def _change_limit(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """What no order may exceed, and how fine the protocol can say it."""
+    """The limits of all orders, and the resolution of the protocol."""
 
     installation: float
-    """Limit that the user typed for this installation, A."""
+    """Limit of the installation, entered by the user, A."""
     reports_maximum: bool = False
-    """The charger tells a maximum of its own; 6 A until it has."""
+    """The charger reports a maximum of its own; 6 A count until it has."""
     reported: float | None = None
-    """Smallest maximum the charger told (connection, hardware, cable), A."""
+    """Smallest maximum that it reports (connection, hardware, cable), A."""
     minimum: float = MINIMUM_CURRENT
-    """Lowest current other than 0 that this charger can offer, A."""
+    """Lowest current above 0 that this charger can offer, A."""
     step: float = 0.1
-    """Step in which the protocol says currents, A."""
+    """Resolution of currents in the protocol, A."""
 
     @property
     def ceiling(self) -> float:
@@ -352,28 +351,28 @@ class Limits:
         return self.installation
 
 
-# -- How a charger is set up -----------------------------------------------------
+# -- Configuration ---------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChargerConfig:
-    """What the user set up for one charger; protocols add their own fields."""
+    """The configuration of one charger; protocols add their own fields."""
 
     key: str
-    """Names the charger for as long as it is set up; not its address."""
+    """Identifies the charger for as long as it is configured; not its address."""
     name: str
     address: int
-    """Where it is on the bus (ABL: device-ID; EVBox: serial number, 0: any)."""
+    """Address on the bus (ABL: device-ID; EVBox: serial number, 0: any)."""
     serial: str | None = None
-    """Identity that must be found there before anything is written."""
+    """Serial number that must be read there before anything is written."""
     installation_limit: float = MINIMUM_CURRENT
     """Highest current the wiring of this charger may carry, A."""
     voltage: float = 230.0
-    """Phase to neutral, V: for estimates where the wire tells none."""
+    """Phase to neutral, V: for estimates where the charger reports none."""
     poll_interval: float = 5.0
-    """Wanted time between two readings, s; 0: as fast as the bus goes."""
+    """Time between two readings, s; 0: as fast as the bus allows."""
     order_lifetime: float | None = None
-    """Time after which an order nobody renewed becomes the fail-safe, s."""
+    """Time after which an order that is not renewed becomes the fail-safe, s."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,6 +1,6 @@
-"""What chargers tell: of themselves, and of each connector.
+"""Readings of a charger and of its connectors.
 
-Units throughout: ampere, volt, watt, watt-hour, second. ``None`` means "not told".
+Units throughout: ampere, volt, watt, watt-hour, second. ``None`` means "not known".
 """
 
 from collections.abc import Mapping
@@ -12,11 +12,11 @@ from .model import UNKNOWN_PHASES, Fault, Mode, Phases, SessionResult, Setting, 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConnectorReading:
-    """What a charger told of one connector (EVBox: one ChargeBox module)."""
+    """The reading of one connector (EVBox: one ChargeBox module)."""
 
     status: Status | None = None
     raw_state: str | None = None
-    """The charger's own word: an IEC 61851 state such as ``C2``."""
+    """The charger's own state, such as ``C2`` of IEC 61851."""
     plugged: bool | None = None
     charging: bool | None = None
     current: Phases[float | None] = UNKNOWN_PHASES
@@ -33,7 +33,7 @@ class ConnectorReading:
     estimated_power: float | None = None
     """Power from measured current and a configured voltage, W."""
     estimated_energy: float | None = None
-    """Estimated power summed since this object began to listen, Wh."""
+    """Estimated power integrated since the library was started, Wh."""
     minimum_current: float | None = None
     """Current below which this connector cannot charge, A."""
     session_energy: float | None = None
@@ -49,7 +49,7 @@ class ConnectorReading:
     last_end: datetime | None = None
     """When the last charge ended, by the clock of the box, without a zone."""
     user: str | None = field(default=None, repr=False)
-    """Who has logged in with a card."""
+    """The user who has logged in with a card."""
     cable_current: float | None = None
     """Rated current of the cable, A."""
     locked: bool | None = None
@@ -59,51 +59,51 @@ class ConnectorReading:
     optimised: bool | None = None
     """The next start is an optimised one."""
     start_requested: bool | None = None
-    """Somebody wants to charge, and waits for our permission."""
+    """A start was requested at the box; it waits for our permission."""
     rcd_tripped: bool | None = None
     ventilation_requested: bool | None = None
-    """The car wants the room to be ventilated."""
+    """The car requests ventilation of the room."""
     pilot_low: float | None = None
     """Lowest level of the control pilot, V."""
     pilot_high: float | None = None
     """Highest level of the control pilot, V."""
     proximity_voltage: float | None = None
-    """At the contact that tells of the cable, V."""
+    """At the proximity contact of the cable, V."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChargerReading:
-    """What a charger told of itself and of its connectors."""
+    """The reading of a charger and of its connectors."""
 
     connectors: Mapping[int, ConnectorReading] = field(default_factory=dict)
     """By number, 1..n."""
     allowed: bool | None = None
-    """Whether the charger lets a car charge, as the charger says it."""
+    """Whether the charger lets a car charge, by its own report."""
     offered_current: float | None = None
     """Current offered to the car now, A; 0: charging is paused."""
     maximum_current: float | None = None
     """Maximum of the connection or the box, A."""
     minimum_interval: float | None = None
-    """The charger does not want to be asked more often than this, s."""
+    """Shortest time between two requests that the charger accepts, s."""
     outlet_enabled: bool | None = None
     mode: Mode | None = None
     server_connected: bool | None = None
-    """The box says that it is connected to its server."""
+    """The box reports a connection to its server."""
     ventilating: bool | None = None
     temperature: float | None = None
     """Inside the box, degrees Celsius."""
     settings: Mapping[Setting, int] = field(default_factory=dict)
-    """What is set in its own memory, as far as it was read."""
+    """Settings in its own memory, as far as they were read."""
     faults: frozenset[Fault] = frozenset()
     fault_codes: tuple[str, ...] = ()
     """The charger's own codes for its faults, raw (``F9``)."""
     details: Mapping[str, str | int | float | bool | None] = field(default_factory=dict)
-    """More that the charger told, for diagnostics only."""
+    """Further values that it reports, for diagnostics only."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChargerInfo:
-    """What a charger is; does not change while it runs."""
+    """Identity and type of a charger; constant while it runs."""
 
     manufacturer: str
     model: str
@@ -111,4 +111,4 @@ class ChargerInfo:
     firmware: str | None = None
     hardware: str | None = None
     options: Mapping[str, str | int | bool | None] = field(default_factory=dict)
-    """Configuration bits the charger told, by name."""
+    """Configuration bits reported by the charger, by name."""

@@ -1,4 +1,4 @@
-"""From a wish to a set-point: the only way to an encoder. Pure functions.
+"""From orders to a set-point: the only way to an encoder. Pure functions.
 
 Every number that reaches a charger's wire as a current comes out of `clamp`.
 Encoders take a `Setpoint`, and only this module makes one (a test holds that).
@@ -13,7 +13,7 @@ from .errors import RefusedOrderError
 from .model import CurrentLimit, Limits, OrderChange, Orders, Phases
 
 MAXIMUM_TIMEOUT = 0xFFFF
-"""Longest fail-safe time-out a protocol can say, s (EVBox: one word)."""
+"""Longest fail-safe time-out that a protocol can encode, s (EVBox: one word)."""
 INTERVALS_PER_TIMEOUT = 3
 """A time-out is at least this many intervals: two requests in a row may get lost."""
 
@@ -36,15 +36,15 @@ class Setpoint:
 
     @property
     def current(self) -> float:
-        """Return the one current of a protocol without phases: the smallest, A."""
+        """Return the current of a protocol without phase limits: the smallest, A."""
         return min(self.currents)
 
 
 def number(value: object, what: str = "value") -> float:
-    """Return a wish as a finite, non-negative float.
+    """Return a requested value as a finite, non-negative float.
 
     Raises RefusedOrderError for anything else: NaN passes Home Assistant's own
-    range check, and a bool or a string is nobody's current.
+    range check, and a bool or a string is not a current.
     """
     if isinstance(value, bool) or not isinstance(value, (Real, Decimal)):
         message = f"{what} is not a number: {value!r}"
@@ -71,13 +71,13 @@ def round_down(value: float, step: float) -> float:
 
 
 def clamp(orders: Orders, limits: Limits) -> Setpoint:
-    """Return what may be sent for these orders within these limits.
+    """Return the set-point for these orders within these limits.
 
     Raises RefusedOrderError when an order is not a finite number from 0.
     """
     if orders.allowed is False:
         currents: Phases[float] = (0.0, 0.0, 0.0)
-        # The wish behind a pause is checked all the same: a bad one must not wait.
+        # The limit behind a pause is checked too: a bad one must not wait for the end.
         _clamp_limit(orders.limit, limits)
     else:
         one, two, three = (
@@ -94,10 +94,10 @@ def clamp(orders: Orders, limits: Limits) -> Setpoint:
 
 def _clamp_limit(limit: CurrentLimit, limits: Limits) -> Phases[float]:
     ceiling = number(limits.ceiling, "ceiling")
-    # Each wish on its own first: min() lets a NaN through or not by its place.
-    for wish in (limit.current, *limit.phases):
-        if wish is not None:
-            number(wish, "current")
+    # Each value on its own first: min() passes a NaN or not, depending on its place.
+    for value in (limit.current, *limit.phases):
+        if value is not None:
+            number(value, "current")
     one, two, three = (
         round_down(min(value, ceiling), limits.step) for value in limit.effective()
     )
@@ -169,9 +169,9 @@ def _check_timeout(value: int | None) -> int | None:
 def cautious(old: Orders, new: Orders) -> Orders:
     """Return the lower of two sets of orders, field by field.
 
-    This is what is stored before a change is sent: a lowering counts at once, a
-    raise only when the charger has confirmed it. Whether a longer time-out is
-    the more careful one nobody can say; the new one waits for the answer.
+    It is stored before a change is sent: a lowering counts at once, a raise only when
+    the charger has confirmed it. A longer time-out is neither safer nor less safe in
+    general, so a new one waits for the confirmation.
     """
     return Orders(
         allowed=_less_allowed(old.allowed, new.allowed),
@@ -196,7 +196,7 @@ def _lower_limit(old: CurrentLimit, new: CurrentLimit) -> CurrentLimit:
 
 
 def expired(orders: Orders) -> Orders:
-    """Return orders that nobody renewed in time: the fail-safe as the limit.
+    """Return the orders that follow after their lifetime: the fail-safe is the limit.
 
     Permission stays what it is: no passing of time starts a stopped car.
     """

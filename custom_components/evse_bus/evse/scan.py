@@ -1,11 +1,11 @@
-"""What a scan of a bus found."""
+"""The result of a scan of a bus."""
 
 from dataclasses import dataclass
 
 from .readings import ChargerInfo
 
 type Address = int | str
-"""Where a charger is on its bus; of a box that is alone there, its serial number."""
+"""Address of a charger on its bus; of a box that is alone there, its serial number."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -16,7 +16,7 @@ class FoundCharger:
     info: ChargerInfo
     serial: str | None = None
     maximum_current: float | None = None
-    """Maximum that it told, A."""
+    """Maximum that it reports, A."""
     connectors: int = 1
     maximum_currents: tuple[float | None, ...] = ()
     """Of each port, where a box has ports of its own, A."""
@@ -24,14 +24,14 @@ class FoundCharger:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScanResult:
-    """What a scan of a bus found."""
+    """The result of a scan of a bus."""
 
     found: tuple[FoundCharger, ...] = ()
     duplicates: tuple[int, ...] = ()
     """Addresses at which more than one charger answers."""
     unreadable: bool = False
-    """Bytes came that no frame could be made of: wrong protocol or parity."""
+    """Bytes came, but no good frame: wrong protocol or parity."""
     unsupported: tuple[FoundCharger, ...] = ()
-    """Those that answered with a firmware that cannot be used this way."""
+    """Chargers with a firmware that cannot be used in this way."""
     other_master: bool = False
-    """Another master speaks on this line; so we said nothing."""
+    """Another master is active on this line; nothing was sent."""

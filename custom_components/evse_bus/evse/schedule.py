@@ -1,13 +1,13 @@
-"""Who speaks next on a bus: a pure function of what waits and of the time.
+"""The next turn on a bus: a pure function of the waiting slots and of the time.
 
 The rules (they are the bus's promises, each with a test):
 
 - hard deadlines first: nothing is started whose worst case would make one late;
 - then commands, a pause before any other;
 - then polls, earliest due first;
-- then probes of chargers that do not answer. Where the living keep the bus busy
-  all the time, one probe is let in after each of them has had its turn, so that
-  a dead charger costs a living one at most one reply time-out a round.
+- then probes of chargers that do not answer. On a bus that is busy all the time one
+  probe is let in after each available charger has had its turn, so that a dead
+  charger costs the others at most one reply time-out a round.
 """
 
 from collections.abc import Iterable, Sequence
@@ -17,7 +17,7 @@ from math import inf
 
 
 class Kind(IntEnum):
-    """What a turn is for, the most urgent first."""
+    """Kind of a turn, the most urgent first."""
 
     PAUSE = 0
     COMMAND = 1
@@ -27,7 +27,7 @@ class Kind(IntEnum):
 
 @dataclass(slots=True, eq=False, kw_only=True)
 class Slot:
-    """Something that wants the bus. All times are loop times, s."""
+    """A claim to a turn on the bus. All times are loop times, s."""
 
     kind: Kind
     ready: float = 0.0
@@ -39,14 +39,14 @@ class Slot:
     worst_case: float = 0.0
     """Longest time one turn can take, time-out included, s."""
     served: float = field(default=-inf)
-    """When it last had a turn."""
+    """Time of its last turn."""
     meets: Slot | None = None
-    """A slot whose deadline this turn meets as well: it does not stand in the way."""
+    """A slot whose deadline this turn meets as well."""
 
 
 @dataclass(frozen=True, slots=True)
 class Choice[S: Slot]:
-    """The slot to serve now, or else when to look again."""
+    """The slot to serve now, or else the time of the next choice."""
 
     slot: S | None
     wake_at: float = inf
@@ -55,7 +55,7 @@ class Choice[S: Slot]:
 
 
 def choose[S: Slot](slots: Sequence[S], now: float, last_probe: float) -> Choice[S]:
-    """Return who speaks now.
+    """Return the slot to serve now.
 
     ``last_probe`` is when the last probe was started (-inf: never).
     """
@@ -80,7 +80,7 @@ def _order(slot: Slot) -> tuple[int, float]:
 
 
 def _probe_let_in[S: Slot](waiting: Iterable[S], last_probe: float) -> S | None:
-    """Return the probe that has waited for a whole round of the living, if any."""
+    """Return the probe that has waited for a whole round of polls, if any."""
     first: S | None = None
     for slot in waiting:
         if slot.kind is Kind.PROBE:
@@ -108,7 +108,7 @@ def _leaves_room(slot: Slot, deadlines: Iterable[Slot], now: float) -> bool:
     end = now + slot.worst_case
     for other in deadlines:
         latest = max(other.start_by, other.ready)
-        # One that is late already blocks nobody: a pause must still get through.
+        # One that is late already blocks no other: a pause must still get through.
         if other is slot or other is slot.meets or latest < now:
             continue
         start = max(end, other.ready)
@@ -119,7 +119,7 @@ def _leaves_room(slot: Slot, deadlines: Iterable[Slot], now: float) -> bool:
 
 
 def _next_look(slots: Iterable[Slot], deadlines: Iterable[Slot], now: float) -> float:
-    """Return when something becomes ready, or has to go out after all."""
+    """Return the time at which a slot becomes ready or meets its deadline."""
     times = [slot.ready for slot in slots if slot.ready > now]
     times.extend(max(slot.start_by, slot.ready) for slot in deadlines)
     return min(times, default=inf)

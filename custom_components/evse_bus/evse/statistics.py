@@ -1,4 +1,4 @@
-"""What a bus counts, and the last frames that passed on it."""
+"""Counters of a bus and its chargers, and a log of the last frames."""
 
 from collections import deque
 from collections.abc import Iterator
@@ -9,18 +9,18 @@ from time import time
 from typing import Final
 
 WINDOW: Final = 60.0
-"""Time over which utilisation is told, s."""
+"""Time over which utilisation is computed, s."""
 KEPT_FRAMES: Final = 200
 
 
 @dataclass(slots=True)
 class BusStatistics:
-    """Counted since the bus was made; survives a lost port."""
+    """Counters since the bus was created; they survive a lost port."""
 
     requests: int = 0
     replies: int = 0
     sent_only: int = 0
-    """Frames that nobody answers: broadcasts, acknowledgements."""
+    """Frames without a reply: broadcasts, acknowledgements."""
     timeouts: int = 0
     retries: int = 0
     merged: int = 0
@@ -28,21 +28,21 @@ class BusStatistics:
     frames: int = 0
     bad_frames: int = 0
     foreign_frames: int = 0
-    """Good frames that were nobody's answer: late, or other people's."""
+    """Good frames that matched no request: late, or of other masters."""
     unsolicited: int = 0
     noise_bytes: int = 0
     missed_deadlines: int = 0
     for_deadline: int = 0
     """Turns taken early because a deadline left room for nothing else."""
     line_busy: int = 0
-    """Turns given up because others kept talking."""
+    """Turns given up because the line was never quiet."""
     reopened: int = 0
     busy_time: float = 0.0
     """Time in which an exchange was under way, s."""
     _marks: deque[tuple[float, float]] = field(default_factory=deque)
 
     def busy(self, start: float, end: float) -> None:
-        """Note that the bus was in use from start to end (loop times)."""
+        """Count the time from start to end (loop times, s) as busy."""
         self.busy_time += end - start
         if not self._marks or end - self._marks[-1][0] >= WINDOW / 12:
             self._marks.append((end, self.busy_time))
@@ -61,7 +61,7 @@ class BusStatistics:
 
 @dataclass(slots=True)
 class ChargerStatistics:
-    """What the bus noticed of one charger."""
+    """Counters of one charger."""
 
     requests: int = 0
     replies: int = 0
@@ -69,7 +69,7 @@ class ChargerStatistics:
     bad_frames: int = 0
     refused: int = 0
     reasserted: int = 0
-    """How often a limit had to be sent again because the box stood above it."""
+    """Limits sent again because the box was above them."""
     implausible: int = 0
     missed_deadlines: int = 0
     round_trip_min: float = inf
@@ -77,7 +77,7 @@ class ChargerStatistics:
     round_trip_sum: float = 0.0
 
     def reply(self, took: float) -> None:
-        """Count an answer; ``took``: from the request's first byte on, s."""
+        """Count a reply; ``took``: from the first byte of the request, s."""
         self.replies += 1
         self.round_trip_sum += took
         self.round_trip_min = min(self.round_trip_min, took)
@@ -85,12 +85,12 @@ class ChargerStatistics:
 
     @property
     def round_trip_mean(self) -> float | None:
-        """Return the mean time from a request's first byte to its answer, s."""
+        """Return the mean time from the first byte of a request to its reply, s."""
         return self.round_trip_sum / self.replies if self.replies else None
 
 
 class Direction(StrEnum):
-    """Which way a frame went."""
+    """Direction of a frame."""
 
     OUT = "out"
     IN = "in"
@@ -99,7 +99,7 @@ class Direction(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class LoggedFrame:
-    """One frame as it passed."""
+    """One logged frame."""
 
     when: float
     """Seconds since the epoch."""
@@ -115,7 +115,7 @@ class FrameLog:
         self._frames: deque[LoggedFrame] = deque(maxlen=KEPT_FRAMES)
 
     def add(self, direction: Direction, data: bytes) -> None:
-        """Remember a frame; the oldest one is forgotten."""
+        """Log a frame; the oldest one is dropped."""
         self._frames.append(LoggedFrame(time(), direction, data))
 
     def __iter__(self) -> Iterator[LoggedFrame]:
@@ -123,5 +123,5 @@ class FrameLog:
         return iter(tuple(self._frames))
 
     def __len__(self) -> int:
-        """Return how many are kept."""
+        """Return the number of frames in the log."""
         return len(self._frames)

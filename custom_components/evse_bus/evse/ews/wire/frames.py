@@ -187,7 +187,7 @@ class EwsFramer(Framer[EwsFrame]):
     applications are skipped whole.
     """
 
-    unasked: ClassVar = True
+    unsolicited: ClassVar = True
 
     def __init__(self) -> None:
         """Start with nothing heard."""
@@ -207,7 +207,7 @@ class EwsFramer(Framer[EwsFrame]):
         self._buffer = b""
 
     @override
-    def shown(self, raw: bytes) -> bytes:
+    def redacted(self, raw: bytes) -> bytes:
         return redacted(raw)
 
     @override
