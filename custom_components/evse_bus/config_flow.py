@@ -272,8 +272,8 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
         errors: Errors = {}
         if user_input is not None:
             errors = check_impose(self.protocol, user_input)
-            everybody = ADDRESSES[self.protocol.key].any
-            addresses = [everybody] if single and everybody is not None else []
+            any_address = ADDRESSES[self.protocol.key].any
+            addresses = [any_address] if single and any_address is not None else []
             if not single:
                 addresses, wrong = typed_addresses(self.protocol, user_input)
                 errors |= wrong

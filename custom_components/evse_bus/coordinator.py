@@ -330,7 +330,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
     def async_add_platform(
         self, add_entities: Callable[[ManagedCharger], None]
     ) -> None:
-        """Register a platform: it is called for each charger, now and as it grows."""
+        """Call a platform for each charger, now and when more entities are found."""
         self._platforms.append(add_entities)
         for managed in self.chargers.values():
             add_entities(managed)

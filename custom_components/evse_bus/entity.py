@@ -59,7 +59,7 @@ def add_charger_entities(
     make: Callable[[BusCoordinator, ManagedCharger], Iterable[Entity]],
     obsolete: Callable[[ManagedCharger], Iterable[str]] = lambda _managed: (),
 ) -> None:
-    """Add the entities of a platform for each charger, now and as it grows.
+    """Add the entities of a platform for each charger, now and as more are found.
 
     ``obsolete`` returns the keys of entities that a charger's configuration rules
     out; existing ones are removed from the registry.
