@@ -142,7 +142,7 @@ class Scaled(Numeric[float]):
 
     @override
     def raw(self, value: object) -> int:
-        if isinstance(value, bool) or not isinstance(value, int | float):
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise self.refused("is no number")
         try:
             # Currents are clamped to the step: rounding raises none of them.

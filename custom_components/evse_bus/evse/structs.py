@@ -115,7 +115,7 @@ class Struct[T]:
 
     def encode(self, value: object) -> bytes:
         """Return the bytes of a record; raises RefusedOrderError."""
-        return b"".join(one.encode(getattr(value, one.name)) for one in self.fields)
+        return b"".join([one.encode(getattr(value, one.name)) for one in self.fields])
 
     def changed(self, data: bytes, changes: Mapping[str, object]) -> bytes:
         """Return the same bytes with some fields replaced, and nothing else.
@@ -264,16 +264,16 @@ class Many[V](Field[tuple[V, ...]]):
 
     @override
     def decode(self, data: bytes) -> tuple[V, ...]:
-        step = self.field.width
+        step, decode = self.field.width, self.field.decode
         return tuple(
-            self.field.decode(data[at : at + step]) for at in range(0, self.width, step)
+            [decode(data[at : at + step]) for at in range(0, self.width, step)]
         )
 
     @override
     def encode(self, value: object) -> bytes:
         if not isinstance(value, tuple) or len(value) != self.count:
             raise self.refused(f"are {self.count}")
-        return b"".join(self.field.encode(one) for one in value)
+        return b"".join([self.field.encode(one) for one in value])
 
     @override
     def named(self, name: str) -> Self:

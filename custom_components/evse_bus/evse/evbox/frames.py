@@ -6,7 +6,7 @@ characters, not over the bytes they stand for (PROTOCOLS.md section 1: only so
 the manual's command 69 request gives its printed F703).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import reduce
 from operator import xor
@@ -14,9 +14,11 @@ from string import hexdigits
 from typing import Final, Literal, override
 
 from ..errors import GarbledReplyError
+from ..fields import Number, Scaled
 from ..framing import Frame, Framer
 from ..model import Phases
 from ..safety import Setpoint
+from ..structs import Struct, coded, phases, record
 
 type CommandNumber = Literal[68, 69]
 
@@ -28,7 +30,7 @@ SMARTGRID: Final = "A0"
 """Our own address (manual, "Addresses")."""
 
 ANY_SERIAL: Final = 0
-"""Every ChargePoint listens to this serial number (manual, command 68)."""
+"""Addresses every ChargePoint (manual, command 68)."""
 LARGEST_SERIAL: Final = 99_999_999
 INFORMATION_LENGTH: Final = 16
 MAXIMUM_MODULES: Final = 20
@@ -38,86 +40,72 @@ _HEADER: Final = 6
 _CHECKSUMS: Final = 4
 
 
-@dataclass(frozen=True, slots=True)
-class Field:
-    """One number in a message."""
+# -- Tables ------------------------------------------------------------------------
+#
+# Source: manual, "Command 68" and "Command 69", tables "Request" and "Response", with
+# notes * (tenths of an ampere) and *** (cos phi / 1000). A byte is two characters.
 
-    name: str
-    width: int
-    """Bytes; each is two characters on the wire."""
-    unit: str
-    divisor: int = 1
-    """The number on the wire is the value times this."""
-    signed: bool = False
-
-    @property
-    def characters(self) -> int:
-        """Return its length on the wire."""
-        return 2 * self.width
-
-    def encode(self, value: float) -> str:
-        """Return the characters; ValueError for what does not fit."""
-        # Currents come from the clamp and are on the step: nothing is rounded up.
-        raw = round(value * self.divisor)
-        try:
-            return raw.to_bytes(self.width, signed=self.signed).hex().upper()
-        except OverflowError as error:
-            message = f"{self.name} {value} {self.unit} does not fit"
-            raise ValueError(message) from error
-
-    def decode(self, text: str) -> float:
-        """Return the value of these characters."""
-        raw = int.from_bytes(bytes.fromhex(text), signed=self.signed)
-        return raw / self.divisor if self.divisor > 1 else raw
+_AMPERES: Final = Scaled(width=2, unit="A", divisor=10)
 
 
-def _phases(name: str, unit: str, divisor: int = 1, *, signed: bool = False) -> _Fields:
-    return tuple(
-        Field(f"{name} {phase}", 2, unit, divisor, signed)
-        for phase in ("L1", "L2", "L3")
+@record
+class Order:
+    """The set-point in a request."""
+
+    currents: Phases[float] = coded(phases(_AMPERES))
+    """A"""
+    timeout: int = coded(Number(width=2, unit="s"))
+    fail_safe: Phases[float] = coded(phases(_AMPERES))
+    """After the time-out, A."""
+
+
+@record
+class Head:
+    """The part of a reply before the modules."""
+
+    minimum_interval: int = coded(Number(width=2, unit="s"))
+    """Minimum allowed interval time, s."""
+    maximum_current: float = coded(_AMPERES)
+    """Maximum phase current of the connection, A."""
+    modules: int = coded(Number(width=1))
+
+
+@record
+class ModuleReply:
+    """The part of a reply for one ChargeBox module."""
+
+    minimum_current: float = coded(_AMPERES)
+    """Minimum required phase current, A."""
+    currents: Phases[float] = coded(phases(_AMPERES))
+    """Used phase currents, A."""
+    cos_phi: Phases[float] = coded(phases(Scaled(width=2, divisor=1000, signed=True)))
+    energy: int = coded(Number(width=4, unit="Wh"))
+    """Meter total, Wh."""
+    voltages: Phases[float] | None = coded(
+        phases(Number(width=2, unit="V")), default=None
     )
+    """V; command 68 only."""
 
 
-type _Fields = tuple[Field, ...]
-
-# The source of all that follows: manual, "Command 68" and "Command 69", tables
-# "Request" and "Response"; notes * (tenths of an ampere) and *** (cos phi / 1000).
-ORDER: Final[_Fields] = (
-    *_phases("maximum", "A", 10),
-    Field("time-out", 2, "s"),
-    *_phases("maximum after time-out", "A", 10),
-)
+ORDER: Final = Struct(Order, "Request")
+HEAD: Final = Struct(Head, "Response")
+_MODULE_68: Final = Struct(ModuleReply, "Response 68, module")
+MODULE: Final[Mapping[int, Struct[ModuleReply]]] = {
+    68: _MODULE_68,
+    69: Struct(ModuleReply, "Response 69, module", _MODULE_68.fields[:-1]),
+}
 SERIAL_CHARACTERS: Final = 8
 """Eight decimal digits as they read: 1923054 is ``01923054`` (68 only)."""
-HEAD: Final[_Fields] = (
-    Field("minimum interval", 2, "s"),
-    Field("maximum of connection", 2, "A", 10),
-    Field("modules", 1, ""),
-)
-MODULE_69: Final[_Fields] = (
-    Field("minimum required", 2, "A", 10),
-    *_phases("used", "A", 10),
-    *_phases("cos phi", "", 1000, signed=True),
-    Field("meter", 4, "Wh"),
-)
-MODULE_68: Final[_Fields] = (*MODULE_69, *_phases("voltage", "V"))
-MODULE: Final[Mapping[int, _Fields]] = {68: MODULE_68, 69: MODULE_69}
-
-
-def _length(fields: _Fields) -> int:
-    return sum(field.characters for field in fields)
-
 
 _FRAME_EXTRA: Final = 1 + _HEADER + _CHECKSUMS + 1
 LONGEST_REQUEST: Final[Mapping[int, int]] = {
-    68: _FRAME_EXTRA + SERIAL_CHARACTERS + 2 * INFORMATION_LENGTH + _length(ORDER),
-    69: _FRAME_EXTRA + _length(ORDER),
+    68: _FRAME_EXTRA + SERIAL_CHARACTERS + 2 * (INFORMATION_LENGTH + ORDER.length),
+    69: _FRAME_EXTRA + 2 * ORDER.length,
 }
 LONGEST_FRAME: Final = (
     _FRAME_EXTRA
     + SERIAL_CHARACTERS
-    + _length(HEAD)
-    + MAXIMUM_MODULES * _length(MODULE_68)
+    + 2 * (HEAD.length + MAXIMUM_MODULES * _MODULE_68.length)
 )
 """A reply 68 of 20 modules: 990 bytes."""
 
@@ -139,7 +127,7 @@ def frame(text: str) -> bytes:
 def encode_68(
     setpoint: Setpoint, *, serial: int = ANY_SERIAL, information: bytes
 ) -> bytes:
-    """Return a request 68; ValueError for a serial or information that cannot be."""
+    """Return a request 68; ValueError for an invalid serial or information module."""
     if not 0 <= serial <= LARGEST_SERIAL:
         message = f"serial number {serial} has no 8 digits"
         raise ValueError(message)
@@ -160,33 +148,20 @@ def encode_69(setpoint: Setpoint) -> bytes:
 def _order(setpoint: Setpoint) -> str:
     if setpoint.fail_safe_timeout < 1:
         raise ValueError("a time-out of 0 is not allowed")
-    values = (*setpoint.currents, setpoint.fail_safe_timeout, *setpoint.fail_safe)
-    return "".join(
-        field.encode(value) for field, value in zip(ORDER, values, strict=True)
+    order = Order(
+        currents=setpoint.currents,
+        timeout=setpoint.fail_safe_timeout,
+        fail_safe=setpoint.fail_safe,
     )
+    return ORDER.encode(order).hex().upper()
 
 
 # -- Replies -----------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ModuleReply:
-    """What a reply says of one ChargeBox module."""
-
-    minimum_current: float
-    """Minimum required phase current, A."""
-    currents: Phases[float]
-    """Used phase currents, A."""
-    cos_phi: Phases[float]
-    energy: int
-    """Meter total, Wh."""
-    voltages: Phases[float] | None = None
-    """V; command 68 only."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Reply:
-    """The answer of a ChargePoint to command 68 or 69."""
+    """The reply of a ChargePoint to command 68 or 69."""
 
     command: int
     serial: str | None = None
@@ -200,7 +175,7 @@ class Reply:
 
 @dataclass(frozen=True, slots=True)
 class EvboxFrame(Frame):
-    """A frame with good checksums, from anybody to anybody."""
+    """A frame with good checksums, from any device on the bus."""
 
     raw: bytes
     text: str
@@ -208,7 +183,7 @@ class EvboxFrame(Frame):
 
     @property
     def is_reply(self) -> bool:
-        """Return whether a ChargePoint answers a SmartGrid module with 68 or 69."""
+        """Return whether this is the reply of a ChargePoint to command 68 or 69."""
         return _is_reply(self.text)
 
 
@@ -218,22 +193,26 @@ def _is_reply(text: str) -> bool:
     )
 
 
+def _start(command: int) -> int:
+    """Return where the `Head` of a reply begins, in characters."""
+    return _HEADER + (SERIAL_CHARACTERS if command == 68 else 0)
+
+
 def _fits(text: str) -> bool:
-    """Return whether a reply is hex, and as long as its module count says."""
+    """Return whether a reply is hex, and as long as its module count states."""
     if not _HEX.issuperset(text):
         return False
     command = int(text[4:_HEADER])
-    start = _HEADER + (SERIAL_CHARACTERS if command == 68 else 0)
-    end = start + _length(HEAD)
+    end = _start(command) + 2 * HEAD.length
     if len(text) < end:
         return False
-    modules = int(text[end - HEAD[-1].characters : end], 16)
-    wanted = end + modules * _length(MODULE[command])
+    modules = int(text[end - 2 : end], 16)
+    wanted = end + 2 * modules * MODULE[command].length
     return modules <= MAXIMUM_MODULES and len(text) == wanted
 
 
 def decode_reply(received: EvboxFrame) -> Reply | None:
-    """Return what a reply 68 or 69 says; ``None``: a frame of somebody else.
+    """Return the contents of a reply 68 or 69; ``None``: not such a reply.
 
     Raises GarbledReplyError for a reply whose length does not fit its modules.
     """
@@ -244,40 +223,18 @@ def decode_reply(received: EvboxFrame) -> Reply | None:
         message = f"a reply that does not fit its module count: {text[:24]}..."
         raise GarbledReplyError(message)
     command = int(text[4:_HEADER])
-    at = _HEADER
-    serial = None
-    if command == 68:
-        serial = text[at : at + SERIAL_CHARACTERS]
-        at += SERIAL_CHARACTERS
-    (interval, maximum, count), at = _read(text, at, HEAD)
-    modules = []
-    for _ in range(int(count)):
-        values, at = _read(text, at, MODULE[command])
-        modules.append(_module(values))
+    module = MODULE[command]
+    data = bytes.fromhex(text[_start(command) :])
+    head = HEAD.decode(data[: HEAD.length])
     return Reply(
         command=command,
-        serial=serial,
-        minimum_interval=int(interval),
-        maximum_current=maximum,
-        modules=tuple(modules),
-    )
-
-
-def _read(text: str, at: int, fields: _Fields) -> tuple[list[float], int]:
-    values = []
-    for field in fields:
-        values.append(field.decode(text[at : at + field.characters]))
-        at += field.characters
-    return values, at
-
-
-def _module(values: Sequence[float]) -> ModuleReply:
-    return ModuleReply(
-        minimum_current=values[0],
-        currents=(values[1], values[2], values[3]),
-        cos_phi=(values[4], values[5], values[6]),
-        energy=int(values[7]),
-        voltages=(values[8], values[9], values[10]) if len(values) > 8 else None,
+        serial=text[_HEADER : _start(command)] or None,
+        minimum_interval=head.minimum_interval,
+        maximum_current=head.maximum_current,
+        modules=tuple(
+            module.decode(data[at : at + module.length])
+            for at in range(HEAD.length, len(data), module.length)
+        ),
     )
 
 
@@ -285,22 +242,22 @@ def _module(values: Sequence[float]) -> ModuleReply:
 
 
 class EvboxFramer(Framer[EvboxFrame]):
-    """Finds frames; a new STX before an ETX starts afresh (real boxes do that)."""
+    """Finds frames; real boxes may begin a new one (STX) before the ETX of the last."""
 
     def __init__(self) -> None:
-        """Start with nothing heard."""
+        """Start with an empty buffer."""
         super().__init__()
         self._buffer = bytearray()
 
     @property
     @override
     def pending(self) -> int:
-        """Return the number of bytes of a frame begun and not ended."""
+        """Return the number of bytes of an unfinished frame."""
         return len(self._buffer)
 
     @override
     def reset(self) -> None:
-        """Forget a frame begun; its bytes count as noise."""
+        """Drop an unfinished frame; its bytes count as noise."""
         self._drop(len(self._buffer))
 
     @override
@@ -312,7 +269,7 @@ class EvboxFramer(Framer[EvboxFrame]):
         while (start := buffer.find(STX)) >= 0:
             self._drop(start)
             end = buffer.find(ETX)
-            # A half frame before a new one: its bytes are lost.
+            # An unfinished frame before a new one is lost.
             restart = buffer.find(STX, 1, end if end >= 0 else len(buffer))
             if restart > 0:
                 self._overlong(restart)
@@ -357,7 +314,7 @@ def _checked(content: bytes) -> str | None:
     text = content[:-_CHECKSUMS].decode("ascii")
     if checksums(text) != content[-_CHECKSUMS:].decode("ascii"):
         return None
-    # The data of other people's commands may hold other characters (a "digit K").
+    # Commands of other devices may contain other characters (a "digit K").
     if not _HEX.issuperset(text[:_HEADER]) or (_is_reply(text) and not _fits(text)):
         return None
     return text
