@@ -16,7 +16,7 @@ ROWS = {
     if line.startswith("| `")
     and len(cells := [cell.strip() for cell in line.strip("|").split("|")]) == 8
 }
-LIBRARY = "custom_components.evse_bus.evse.ews"
+LIBRARY = "custom_components.evse_bus.evse.ews.wire"
 
 
 def test_every_command_has_its_row() -> None:
