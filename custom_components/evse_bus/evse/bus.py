@@ -230,7 +230,7 @@ class Bus(Observable):
         job = Job(
             owner=None,
             kind=kind,
-            due=asyncio.get_running_loop().time(),
+            due=self.now,
             worst_case=self.wire.exchange_time(),
             conversation=conversation,
         )
@@ -258,7 +258,6 @@ class Bus(Observable):
     # -- The one task that owns the line -----------------------------------------
 
     async def _run(self) -> None:
-        loop = asyncio.get_running_loop()
         while True:
             slot = None
             try:
@@ -267,7 +266,7 @@ class Bus(Observable):
                 slots = self._slots()
                 if self._stopping and not slots:
                     return
-                choice = choose(slots, loop.time(), self._last_probe)
+                choice = choose(slots, self.now, self._last_probe)
                 slot = choice.slot
                 if slot is None:
                     await self._timer.sleep_until(choice.wake_at)
@@ -278,17 +277,17 @@ class Bus(Observable):
                 # Without this task all chargers of the bus would fall silent.
                 _LOGGER.exception("%s: a turn failed unexpectedly", self.name)
                 if slot is not None:
-                    slot.ready = loop.time() + self.wire.timing.backoff
+                    slot.ready = self.now + self.wire.timing.backoff
 
     async def _serve(self, slot: Slot) -> None:
-        now = asyncio.get_running_loop().time()
+        started = self.now
         self._turn_of = slot
         try:
-            await self._turn(slot, now)
+            await self._turn(slot, started)
         finally:
             self._turn_of = None
             self._turn_over.set()
-            self.wire.statistics.busy(now, asyncio.get_running_loop().time())
+            self.wire.statistics.busy(started, self.now)
 
     def _slots(self) -> list[Slot]:
         if self._stopping:
@@ -331,15 +330,14 @@ class Bus(Observable):
             await master.turn(Turn(self.wire, master.statistics))
         except EvseError as error:
             _LOGGER.debug("%s: %s", self.name, error)
-            master.failed(asyncio.get_running_loop().time())
+            master.failed(self.now)
         except Exception:
             # A mistake of ours must not end the bus for all other chargers.
             _LOGGER.exception("%s: the master's turn failed unexpectedly", self.name)
-            master.failed(asyncio.get_running_loop().time())
+            master.failed(self.now)
 
     async def _poll_turn(self, charger: Charger) -> None:
-        loop = asyncio.get_running_loop()
-        charger.expire_orders(loop.time())
+        charger.expire_orders(self.now)
         poll = RunningConversation(
             charger.poll(Turn(self.wire, charger.statistics)), bursts=charger.bursts
         )
@@ -347,39 +345,36 @@ class Bus(Observable):
             pause = await poll.go_on()
         except LineError as error:
             self._skip_poll(charger, error)
-            return
         except ImplausibleReplyError as error:
             # It did answer; an implausible reply changes nothing.
             _LOGGER.debug("%s: %s", charger.config.name, error)
             charger.statistics.implausible += 1
-            charger.plan(loop.time())
-            return
+            charger.plan(self.now)
         except EvseError as error:
             _LOGGER.debug("%s: %s", charger.config.name, error)
-            charger.on_missed(loop.time())
-            return
+            charger.on_missed(self.now)
         except Exception:
             # A mistake of ours must not end the bus for all other chargers.
             _LOGGER.exception("%s: a poll failed unexpectedly", charger.config.name)
-            charger.on_missed(loop.time())
-            return
-        now = loop.time()
-        charger.on_reply(now)
-        charger.plan(now)
-        if pause is not None:
-            rest_of_poll = FollowUp(charger.poll, pause.pause, pause.worst_case)
-            self._follow_up(charger, rest_of_poll, Persistence.STANDING, poll)
-        elif poll.result is not None:
-            self._follow_up(charger, poll.result, Persistence.STANDING)
-        if charger.fingerprint != charger.last_fingerprint:
-            charger.updated()
+            charger.on_missed(self.now)
+        else:
+            now = self.now
+            charger.on_reply(now)
+            charger.plan(now)
+            if pause is not None:
+                goes_on = FollowUp(charger.poll, pause.pause, pause.worst_case)
+                self._follow_up(charger, goes_on, Persistence.STANDING, poll)
+            elif poll.result is not None:
+                self._follow_up(charger, poll.result, Persistence.STANDING)
+            if charger.fingerprint != charger.last_fingerprint:
+                charger.updated()
 
     def _skip_poll(self, charger: Charger, error: LineError) -> None:
-        """Leave a charger alone for a while when the line itself would not do."""
+        """Postpone a poll that the line itself has prevented."""
         if not isinstance(error, LineLostError):
             _LOGGER.debug("%s: %s", self.name, error)
             self.wire.statistics.line_busy += 1
-        now = asyncio.get_running_loop().time()
+        now = self.now
         patience = self.wire.timing.silence_patience
         charger.slot.ready = now + max(patience, charger.minimum_pause(now))
 
@@ -391,7 +386,7 @@ class Bus(Observable):
         running: RunningConversation[FollowUp | None] | None = None,
     ) -> None:
         """Queue a conversation without a caller; ``running``: it has begun."""
-        now = asyncio.get_running_loop().time()
+        now = self.now
         self._jobs.add(
             Job(
                 owner=charger,
@@ -410,7 +405,7 @@ class Bus(Observable):
         """Postpone all turns of a charger to the end of its minimum interval."""
         if charger is None:
             return
-        now = asyncio.get_running_loop().time()
+        now = self.now
         earliest = now + charger.minimum_pause(now)
         charger.slot.ready = max(charger.slot.ready, earliest)
         for job in self._jobs:
@@ -433,10 +428,10 @@ class Bus(Observable):
     def _on_open(self) -> None:
         self.connected = self._was_open = True
         self.wire.reset()
-        now = asyncio.get_running_loop().time()
+        now = self.now
         for charger in self.chargers.values():
             charger.on_line_open()
-            # It may have heard us a moment ago, before the line was lost.
+            # Its last request may have arrived right before the line was lost.
             charger.slot.ready = now + charger.minimum_pause(now)
         if self.master is not None:
             self.master.on_line_open(now)
@@ -469,13 +464,13 @@ class Bus(Observable):
         pause = REOPEN_FIRST
         while True:
             if not self._stopping:
-                await self._timer.sleep_until(asyncio.get_running_loop().time() + pause)
+                await self._timer.sleep_until(self.now + pause)
             if self._stopping:
                 return False
             try:
                 await self.line.open()
             except LineError as error:
-                _LOGGER.debug("%s: still not there: %s", self.name, error)
+                _LOGGER.debug("%s: the port is still missing: %s", self.name, error)
                 pause = min(pause * 2, REOPEN_LIMIT)
                 continue
             if self._was_open:
