@@ -38,7 +38,8 @@ from custom_components.evse_bus.evse.fields import (
     Text,
     Unused,
 )
-from custom_components.evse_bus.evse.structs import Many, Optional, Part, Struct
+from custom_components.evse_bus.evse.structs import Struct
+from tests.evse.field_values import VALUES, value_of, value_of_struct
 
 LENGTHS: dict[int, list[Struct[Any]]] = {
     9: [info.INFO],
@@ -59,46 +60,23 @@ STRUCTS = [struct for same in LENGTHS.values() for struct in same]
 _letters = st.characters(min_codepoint=0x21, max_codepoint=0x7E)
 
 
-def _numbers(field: Number) -> st.SearchStrategy[int]:
-    valid = field.valid or field.possible or range(1 << 8 * field.width)
-    return st.sampled_from(valid)
-
-
-VALUES: dict[type[Field[Any]], Callable[[Any], st.SearchStrategy[Any]]] = {
-    Number: _numbers,
-    Flag: lambda _: st.booleans(),
-    Flags: lambda field: st.integers(0, 255).map(field.kind),
-    Centivolts: lambda _: (
-        st.none() | st.integers(-1500, 1500).map(lambda value: value / 100)
-    ),
-    Identity: lambda field: st.from_regex(
-        rf"[0-9A-Za-z]{{1,{field.width}}}", fullmatch=True
-    ),
-    Ascii: lambda field: (
-        st.just("") | st.text(_letters, min_size=field.width, max_size=field.width)
-    ),
-    Text: lambda field: st.text("aZ09*-.äöüßÄÖÜé", max_size=field.width),
-    Raw: lambda field: st.binary(min_size=field.width, max_size=field.width),
-    Address: lambda _: st.integers(0, 0xFFFFFFFF).map(IPv4Address),
-    Moment: lambda _: (
-        st.none() | st.datetimes().map(lambda now: now.replace(microsecond=0))
-    ),
-    Unused: lambda _: st.none(),
-    Part: lambda field: value_of_struct(field.struct),
-    Optional: lambda field: st.none() | value_of(field.part),
-    Many: lambda field: st.tuples(*field.count * [value_of(field.field)]),
-}
-
-
-def value_of(field: Field[Any]) -> st.SearchStrategy[Any]:
-    """Return what a field may be, from its kind."""
-    return VALUES[type(field)](field)
-
-
-def value_of_struct(struct: Struct[Any]) -> st.SearchStrategy[Any]:
-    return st.builds(
-        struct.make, **{field.name: value_of(field) for field in struct.fields}
-    )
+VALUES.update(
+    {
+        Centivolts: lambda _: (
+            st.none() | st.integers(-1500, 1500).map(lambda value: value / 100)
+        ),
+        Identity: lambda field: st.from_regex(
+            rf"[0-9A-Za-z]{{1,{field.width}}}", fullmatch=True
+        ),
+        Ascii: lambda field: (
+            st.just("") | st.text(_letters, min_size=field.width, max_size=field.width)
+        ),
+        Address: lambda _: st.integers(0, 0xFFFFFFFF).map(IPv4Address),
+        Moment: lambda _: (
+            st.none() | st.datetimes().map(lambda now: now.replace(microsecond=0))
+        ),
+    }
+)
 
 
 @pytest.mark.parametrize(
