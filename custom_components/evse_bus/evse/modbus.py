@@ -1,10 +1,9 @@
-"""Modbus frames, found and checked by us; contents and checksums by pymodbus.
+"""Modbus frames in ASCII and RTU: finding them in a stream, building requests.
 
-Finding frames is ours because the dialects on these buses break the rules that
-pymodbus' and other frame splitters rely on (ABL answers with ``>``, a SmartEVSE
-leaves the 0x80 out of its exceptions), and because a good frame behind a broken one
-must not be lost. pymodbus gives what needs no port:
-the request contents (PDU) and the checksum.
+pymodbus builds the contents of requests (PDU) and the checksums. Frames are found
+here, because the devices break rules that pymodbus' and other frame splitters rely on
+(ABL replies with ``>``, a SmartEVSE omits the 0x80 of its exceptions), and because a
+good frame behind a broken one must not be lost.
 """
 
 from collections.abc import Sequence
@@ -31,11 +30,11 @@ EXCEPTION: Final = 0x80
 
 _END: Final = b"\r\n"
 _SHORTEST: Final = 3
-"""Unit, function, checksum: bytes that a frame has at least."""
+"""Minimum length of a frame, bytes: unit, function, checksum."""
 _LONGEST: Final = 255
-"""Bytes that a frame has at most (Modbus over serial line, 2.5.2.1: 513 signs)."""
+"""Maximum length of a frame, bytes (Modbus over serial line, 2.5.2.1)."""
 _FRAME: Final = re.compile(rb"[>:]([0-9A-Fa-f]{0,%d})(\r\n?)?" % (2 * _LONGEST))
-"""A start, and how far a frame can be made of what follows."""
+"""A start and the hex digits behind it, with the end if it has arrived."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,22 +43,20 @@ class ModbusFrame(Frame):
 
     raw: bytes
     is_reply: bool | None
-    """It began with the sign of an answer; otherwise it is somebody's request.
-
-    ``None``: RTU has no such sign."""
+    """ASCII: it starts with ``>``, not ``:``. ``None``: RTU does not mark replies."""
     unit: int
     function: int
     data: bytes
-    """What follows the function, without the checksum."""
+    """Contents between function and checksum."""
 
 
 def lrc(data: bytes) -> int:
-    """Return the checksum of Modbus ASCII over these bytes."""
+    """Return the Modbus ASCII checksum over these bytes."""
     return FramerAscii.compute_LRC(data)
 
 
 def ascii_frame(unit: int, pdu: bytes, *, start: bytes = b":") -> bytes:
-    """Return a whole frame in ASCII: a request unless ``start`` says otherwise."""
+    """Return a complete ASCII frame; ``start``: ``:`` for a request, ``>`` a reply."""
     content = bytes((unit,)) + pdu
     body = content + bytes((lrc(content),))
     return start + body.hex().upper().encode() + _END
@@ -68,7 +65,7 @@ def ascii_frame(unit: int, pdu: bytes, *, start: bytes = b":") -> bytes:
 def read_registers(register: int, count: int) -> bytes:
     """Return the PDU that reads holding registers.
 
-    Raises ValueError when there are no such registers.
+    Raises ValueError for a register or count out of range.
     """
     request = ReadHoldingRegistersRequest(address=register, count=count)
     return bytes((request.function_code,)) + request.encode()
@@ -77,7 +74,7 @@ def read_registers(register: int, count: int) -> bytes:
 def read_input_registers(register: int, count: int) -> bytes:
     """Return the PDU that reads input registers (function 0x04).
 
-    Raises ValueError when there are no such registers.
+    Raises ValueError for a register or count out of range.
     """
     request = ReadInputRegistersRequest(address=register, count=count)
     return bytes((request.function_code,)) + request.encode()
@@ -98,7 +95,7 @@ def write_registers(register: int, values: Sequence[int]) -> bytes:
 def registers_read(
     frame: ModbusFrame, count: int, function: int = READ_HOLDING_REGISTERS
 ) -> bytes | None:
-    """Return the bytes of so many registers, ``None`` if it does not hold them."""
+    """Return the bytes of ``count`` registers; ``None``: not a reply with these."""
     length = 2 * count
     if frame.function != function or len(frame.data) != 1 + length:
         return None
@@ -112,16 +109,16 @@ def is_written(frame: ModbusFrame, register: int, count: int) -> bool:
 
 
 def exception_code(frame: ModbusFrame, function: int) -> int | None:
-    """Return the code with which a request was refused, ``None`` if it was not."""
+    """Return the code of an exception reply; ``None``: not an exception."""
     if frame.function != function | EXCEPTION or len(frame.data) != 1:
         return None
     return frame.data[0]
 
 
 def malformed_exception_code(frame: ModbusFrame, function: int) -> int | None:
-    """Return the code of an exception without the 0x80 (SmartEVSE), if it is one.
+    """Return the code of an exception without the 0x80 (SmartEVSE), or ``None``.
 
-    No good answer to any function here has one byte of contents (PROTOCOLS.md, 3).
+    No valid reply to any function here has one byte of contents (PROTOCOLS.md, 3).
     """
     if frame.function != function or len(frame.data) != 1:
         return None
@@ -129,13 +126,13 @@ def malformed_exception_code(frame: ModbusFrame, function: int) -> int | None:
 
 
 class AsciiFramer(Framer[ModbusFrame]):
-    """Finds frames of Modbus ASCII, with ``>`` as the sign of an answer.
+    """Finds frames of Modbus ASCII; ``>`` starts a reply.
 
-    ``:`` starts a request: another master's, or an echo of our own.
+    ``:`` starts a request: of another master, or an echo of our own.
     """
 
     def __init__(self) -> None:
-        """Start with nothing heard."""
+        """Start with an empty buffer."""
         super().__init__()
         self._buffer = b""
 
@@ -163,11 +160,11 @@ class AsciiFramer(Framer[ModbusFrame]):
                 else:
                     self.bad += 1
             elif position == len(buffer):
-                # Its end is still to come.
+                # The end has not arrived yet.
                 self._buffer = found[0]
                 return frames
             elif buffer[position : position + 1] in (b">", b":"):
-                # The next one begins before this one has ended.
+                # The next frame starts before the end of this one.
                 self.noise += len(found[0])
             else:
                 self.bad += 1
@@ -177,7 +174,7 @@ class AsciiFramer(Framer[ModbusFrame]):
 
 
 def _decode(raw: bytes, digits: bytes) -> ModbusFrame | None:
-    """Return the frame of these digits, ``None`` if they do not make one."""
+    """Return the frame of these digits; ``None``: not a valid one."""
     if len(digits) % 2 or len(digits) < 2 * _SHORTEST:
         return None
     content = bytes.fromhex(digits.decode())
@@ -199,22 +196,22 @@ _RTU_EXCEPTION: Final = 5
 _RTU_FIXED: Final = 8
 """Bytes of every request to read, and of every write of one register."""
 _RTU_READ_HEAD: Final = 3
-"""Bytes of an answer to a read up to its count of bytes, and it."""
+"""Bytes of a reply to a read, up to and including its byte count."""
 _RTU_WRITE_HEAD: Final = 7
-"""Bytes of a request to write several registers up to its count of bytes, and it."""
+"""Bytes of a request to write several registers, up to and including its byte count."""
 _RTU_LONGEST: Final = 256
-"""Bytes that a frame has at most (Modbus over serial line, 2.5.1)."""
+"""Maximum length of a frame, bytes (Modbus over serial line, 2.5.1)."""
 _READS: Final = (READ_HOLDING_REGISTERS, READ_INPUT_REGISTERS)
 _KNOWN: Final = (*_READS, WRITE_SINGLE_REGISTER, WRITE_MULTIPLE_REGISTERS)
 
 
 def crc(data: bytes) -> bytes:
-    """Return the checksum of Modbus RTU over these bytes, as it goes on the wire."""
+    """Return the Modbus RTU checksum over these bytes, in wire order."""
     return FramerRTU.compute_CRC(data).to_bytes(2, "big")
 
 
 def rtu_frame(unit: int, pdu: bytes) -> bytes:
-    """Return a whole frame in RTU."""
+    """Return a complete RTU frame."""
     content = bytes((unit,)) + pdu
     return content + crc(content)
 
@@ -222,13 +219,13 @@ def rtu_frame(unit: int, pdu: bytes) -> bytes:
 class RtuFramer(Framer[ModbusFrame]):
     """Finds frames of Modbus RTU by their length and checksum.
 
-    The pauses that end a frame do not survive an adapter, so they are not asked
-    for. A frame may be anybody's request or answer; exceptions are understood with
-    the 0x80 in their function and without.
+    The pauses between frames do not survive an adapter, so they are not used. A frame
+    may be a request or a reply of any device; exceptions are recognised with the 0x80
+    in their function and without.
     """
 
     def __init__(self) -> None:
-        """Start with nothing heard."""
+        """Start with an empty buffer."""
         super().__init__()
         self._buffer = b""
 
@@ -252,7 +249,7 @@ class RtuFramer(Framer[ModbusFrame]):
             lengths = _rtu_lengths(buffer, position)
             frame = _rtu_decode(buffer, position, lengths)
             if begun is not None and frame is not None and _is_weak(frame):
-                # Such bytes are found in the midst of a longer one that still comes.
+                # The unfinished frame before it may contain the same bytes.
                 frame = None
             if frame is not None:
                 self._lose(buffer[taken:position])
@@ -269,20 +266,20 @@ class RtuFramer(Framer[ModbusFrame]):
         return frames
 
     def _lose(self, data: bytes) -> None:
-        """Count bytes that no frame could be made of."""
+        """Count bytes that belong to no frame."""
         self.noise += len(data)
         self.bad += len(data) >= _RTU_EXCEPTION
 
 
 def _is_weak(frame: ModbusFrame) -> bool:
-    """Return whether little but the checksum says that this is a frame."""
+    """Return whether the checksum is the only evidence that this is a frame."""
     return len(frame.raw) == _RTU_EXCEPTION and not frame.function & EXCEPTION
 
 
 def _rtu_lengths(buffer: bytes, start: int) -> tuple[int, ...]:
-    """Return how long a frame that starts here may be; nothing: none starts here.
+    """Return the possible lengths of a frame that starts here; none: no start.
 
-    While what says so has not come yet, the shortest that would hold it.
+    Before the bytes that decide it have arrived: the shortest frame with them.
     """
     if start + 1 == len(buffer):
         return (_RTU_EXCEPTION,)
@@ -293,15 +290,15 @@ def _rtu_lengths(buffer: bytes, start: int) -> tuple[int, ...]:
         return (_RTU_EXCEPTION,)
     counted = _rtu_counted(function, buffer[start : start + _RTU_FIXED])
     if counted == (_RTU_FIXED + 1,) and len(buffer) - start == _RTU_FIXED:
-        # A request to read a register at 0x04xx, or an answer of two words that lacks
-        # its last byte: if that is 00, both checksums are good. No charger has such a
-        # register (PROTOCOLS.md, 3), so the byte is waited for.
+        # A request to read a register at 0x04xx, or a reply of two words without its
+        # last byte: if that is 00, both checksums are good. No charger has such a
+        # register (PROTOCOLS.md, 3), so this waits for the byte.
         return (*counted, _RTU_EXCEPTION)
     return (*counted, _RTU_FIXED, _RTU_EXCEPTION)
 
 
 def _rtu_counted(function: int, head: bytes) -> tuple[int, ...]:
-    """Return how long a frame with a count in it is, if this can be one."""
+    """Return the length of a frame with a byte count, if this can be one."""
     if function in _READS:
         before, count = _RTU_READ_HEAD, head[_RTU_READ_HEAD - 1 : _RTU_READ_HEAD]
     elif function == WRITE_MULTIPLE_REGISTERS:
@@ -316,7 +313,7 @@ def _rtu_counted(function: int, head: bytes) -> tuple[int, ...]:
 def _rtu_decode(
     buffer: bytes, start: int, lengths: tuple[int, ...]
 ) -> ModbusFrame | None:
-    """Return the frame that starts here and has come to its end, if there is one."""
+    """Return the complete frame that starts here; ``None``: there is none."""
     for length in lengths:
         raw = buffer[start : start + length]
         if len(raw) == length and crc(raw[:-_RTU_CHECKSUM]) == raw[-_RTU_CHECKSUM:]:
