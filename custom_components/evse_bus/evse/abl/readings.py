@@ -82,7 +82,7 @@ def phase_currents(snapshot: Snapshot, order: Phases[int]) -> Phases[float | Non
 
 
 def power_of(currents: Phases[float | None], voltage: float) -> float | None:
-    """Return the estimated power of three currents at a voltage, W; ``None``: unknown."""
+    """Return the estimated power of three currents, W; ``None``: unknown."""
     known = [current for current in currents if current is not None]
     return round(sum(known) * voltage, 1) if len(known) == len(currents) else None
 
