@@ -4,10 +4,9 @@ from typing import Final
 
 from ..protocol import Protocol
 from .charger import EvboxCharger
-from .config import EvboxConfig
+from .config import SETTINGS, TIMING, EvboxConfig
 from .frames import EvboxFramer
 from .scan import scan
-from .timing import SETTINGS, TIMING
 
 __all__ = ["PROTOCOL", "EvboxCharger", "EvboxConfig"]
 

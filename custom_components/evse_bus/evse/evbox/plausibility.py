@@ -1,15 +1,15 @@
-"""What a reply may say: held back when it cannot be, taken when it insists.
+"""Plausibility of replies: an implausible one is quarantined until it is confirmed.
 
-Corrupt frames can pass both checksums (PROTOCOLS.md section 1), so a decoded
-reply is checked for what can be. An implausible one is held back and changes
-nothing. `INSISTENCE` consistent ones in a row are the truth: hiding a real
-over-current would be worse than showing a strange value.
+Corrupt frames can pass both checksums (PROTOCOLS.md section 1), so the values of each
+decoded reply are checked. An implausible reply is quarantined and changes nothing.
+`CONFIRMATIONS` consistent ones in a row are accepted all the same: hiding a real
+over-current would be worse than showing an implausible value.
 
-Two replies are consistent when they are strange in the same places (the same
-value of the same module and phase; of an over-current one common phase will do),
-have the same number of modules, and the strange values agree: equal where a
-value does not change while a box runs (maximum, interval, minimum), near where
-it is measured, going on where it is a meter.
+Two implausible replies are consistent when they have the same number of modules, the
+same values in them are implausible (same quantity, module and phase; for over-currents
+one common phase is enough), and these values agree: equal where a value is constant
+while a box runs (maximum, interval, minimum), close where it is measured, and growing
+no faster than possible where it is a meter total.
 """
 
 from collections.abc import Mapping
@@ -18,13 +18,13 @@ from enum import StrEnum
 from typing import Final
 
 from ..errors import ImplausibleReplyError
-from ..model import MAXIMUM_CURRENT, MINIMUM_CURRENT
+from ..model import MAXIMUM_CURRENT, MINIMUM_CURRENT, Phases
+from .config import UNKNOWN_INTERVAL
 from .frames import ModuleReply, Reply
 from .meters import Meters, Totals
-from .timing import UNKNOWN_INTERVAL
 
-INSISTENCE: Final = 3
-"""Consistent replies in a row that are believed whatever they say."""
+CONFIRMATIONS: Final = 3
+"""Consistent replies in a row that are accepted although they are implausible."""
 LARGEST_CONNECTION: Final = 1000.0
 """Highest maximum phase current of a connection, A: 20 modules of 32 A are 640 A."""
 LONGEST_INTERVAL: Final = 600
@@ -33,11 +33,11 @@ HIGHEST_VOLTAGE: Final = 300.0
 """Highest voltage of a phase, V; 0 is a phase that is not connected."""
 CURRENT_FACTOR: Final = 1.1
 CURRENT_OFFSET: Final = 1.0
-"""Used currents may stand this much above the maximum of the connection, A."""
+"""Used currents may be this much above the maximum of the connection, A."""
 
 
-class Oddity(StrEnum):
-    """A kind of value that cannot be."""
+class Quantity(StrEnum):
+    """A quantity whose value may be implausible."""
 
     MAXIMUM = "maximum"
     INTERVAL = "interval"
@@ -48,243 +48,252 @@ class Oddity(StrEnum):
     METER = "meter"
 
 
-_AGREEMENT: Final[Mapping[Oddity, tuple[float, float]]] = {
-    # How far two values may be apart: a share of the larger, and an amount.
-    Oddity.MAXIMUM: (0.0, 0.0),
-    Oddity.INTERVAL: (0.0, 0.0),
-    Oddity.MINIMUM: (0.0, 0.0),
-    Oddity.CURRENT: (0.5, 1.0),
-    Oddity.COS_PHI: (0.1, 0.05),
-    Oddity.VOLTAGE: (0.1, 5.0),
+_AGREEMENT: Final[Mapping[Quantity, tuple[float, float]]] = {
+    # Largest difference of two values: a share of the larger one, plus an amount.
+    Quantity.MAXIMUM: (0.0, 0.0),
+    Quantity.INTERVAL: (0.0, 0.0),
+    Quantity.MINIMUM: (0.0, 0.0),
+    Quantity.CURRENT: (0.5, 1.0),
+    Quantity.COS_PHI: (0.1, 0.05),
+    Quantity.VOLTAGE: (0.1, 5.0),
 }
 
-type Place = tuple[Oddity, int | None, int | None]
-"""What is odd, at which module and phase (from 0; ``None``: of all)."""
-type Oddities = Mapping[Place, float]
+type Place = tuple[Quantity, int | None, int | None]
+"""A quantity, its module and its phase, counted from 0; ``None``: of all."""
+type Values = Mapping[Place, float]
+"""Implausible values by their place, in the unit of the quantity."""
 
 
-def range_oddities(reply: Reply, bound: float | None = None) -> dict[Place, float]:
-    """Return the values of a reply that cannot be, seen by itself.
+def implausible_values(
+    reply: Reply, highest_current: float | None = None
+) -> dict[Place, float]:
+    """Return the values of a reply that are out of range.
 
-    ``bound``: the highest sum of used currents of a phase, A.
+    ``highest_current``: the highest sum of the used currents of a phase, A.
     """
-    odd: dict[Place, float] = {}
+    found: dict[Place, float] = {}
     if not 0 < reply.maximum_current <= LARGEST_CONNECTION:
-        odd[Oddity.MAXIMUM, None, None] = reply.maximum_current
+        found[Quantity.MAXIMUM, None, None] = reply.maximum_current
     if reply.minimum_interval > LONGEST_INTERVAL:
-        odd[Oddity.INTERVAL, None, None] = reply.minimum_interval
+        found[Quantity.INTERVAL, None, None] = reply.minimum_interval
     for index, module in enumerate(reply.modules):
         if module.minimum_current > MAXIMUM_CURRENT:
-            odd[Oddity.MINIMUM, index, None] = module.minimum_current
-        odd |= _phase_oddities(index, module)
-    if bound is not None:
+            found[Quantity.MINIMUM, index, None] = module.minimum_current
+        found |= _implausible_phases(index, module)
+    if highest_current is not None:
         for phase, used in enumerate(used_currents(reply)):
-            if used > bound:
-                odd[Oddity.CURRENT, None, phase] = used
-    return odd
+            if used > highest_current:
+                found[Quantity.CURRENT, None, phase] = used
+    return found
 
 
-def _phase_oddities(index: int, module: ModuleReply) -> dict[Place, float]:
-    odd: dict[Place, float] = {}
+def _implausible_phases(index: int, module: ModuleReply) -> dict[Place, float]:
+    found: dict[Place, float] = {}
     for phase, value in enumerate(module.cos_phi):
         if abs(value) > 1:
-            odd[Oddity.COS_PHI, index, phase] = value
+            found[Quantity.COS_PHI, index, phase] = value
     for phase, value in enumerate(module.voltages or ()):
         if value > HIGHEST_VOLTAGE:
-            odd[Oddity.VOLTAGE, index, phase] = value
-    return odd
+            found[Quantity.VOLTAGE, index, phase] = value
+    return found
 
 
-def used_currents(reply: Reply) -> tuple[float, float, float]:
-    """Return the used currents of L1, L2, L3, all modules together, A."""
+def used_currents(reply: Reply) -> Phases[float]:
+    """Return the used currents of L1, L2 and L3, summed over all modules, A."""
     one, two, three = (
-        # In tenths, as they came: a sum of floats would be a little beside.
+        # Summed in tenths, as on the wire: a sum of floats would not be exact.
         sum(round(module.currents[phase] * 10) for module in reply.modules) / 10
         for phase in range(3)
     )
     return one, two, three
 
 
-class Confirmed:
-    """A number that falls at once, and rises as far as two replies in a row agree."""
+class ConfirmedValue:
+    """A value that falls at once, and rises as far as two replies in a row agree."""
 
     def __init__(self, start: float) -> None:
-        """Begin with what counts before a reply tells."""
+        """Begin with the value that counts before the first reply."""
         self.value = start
-        self.told: float | None = None
-        """What the last reply said."""
-        self.sure = False
-        """Two replies have told it."""
+        self.reported: float | None = None
+        """The value in the last reply."""
+        self.confirmed = False
+        """Two replies have reported one."""
         self._before = start
 
-    def tell(self, value: float) -> None:
-        """Take what a reply said."""
-        self.sure = self.told is not None
-        self.value = min(self._before, value)
-        self.told = self._before = value
+    def update(self, reported: float) -> None:
+        """Take the value of a reply."""
+        self.confirmed = self.reported is not None
+        self.value = min(self._before, reported)
+        self.reported = self._before = reported
 
     @property
     def rising(self) -> bool:
-        """Return whether the last reply said more than counts yet."""
-        return self.told is not None and self.told > self.value
+        """Return whether the last reply reported more than counts yet."""
+        return self.reported is not None and self.reported > self.value
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Taken:
-    """A reply that is believed."""
+class AcceptedReply:
+    """A reply that is plausible, or confirmed by others."""
 
     reply: Reply
     totals: tuple[float | None, ...]
     """Meter totals that may be shown, by module, Wh."""
     generations: tuple[int, ...]
-    oddities: Oddities = field(default_factory=dict)
-    """What cannot be in it, and was believed because it insisted."""
+    """Of the meters, by module (see `Meters`)."""
+    implausible: Values = field(default_factory=dict)
+    """Values that were accepted only because other replies confirmed them."""
 
     @property
     def over_current(self) -> bool:
-        """Return whether more flows than the connection can carry."""
-        return any(oddity is Oddity.CURRENT for oddity, _, _ in self.oddities)
+        """Return whether more current flows than the connection can carry."""
+        return any(quantity is Quantity.CURRENT for quantity, _, _ in self.implausible)
 
     @property
-    def strange(self) -> bool:
-        """Return whether other values are out of their range."""
-        kept = {Oddity.CURRENT, Oddity.METER}
-        return any(oddity not in kept for oddity, _, _ in self.oddities)
+    def out_of_range(self) -> bool:
+        """Return whether other values are out of range; a new meter is not."""
+        others = {Quantity.CURRENT, Quantity.METER}
+        return any(quantity not in others for quantity, _, _ in self.implausible)
 
 
 @dataclass(frozen=True, slots=True)
-class _Seen:
-    """A strange reply, with what is strange in it."""
+class _Checked:
+    """A reply and its implausible values."""
 
     reply: Reply
-    oddities: Oddities
+    implausible: Values
     totals: Totals
 
 
 class Plausibility:
-    """What is believed of one ChargePoint, reply after reply."""
+    """The values of one ChargePoint that are accepted, reply after reply."""
 
     def __init__(self) -> None:
-        """Believe nothing yet."""
-        self.maximum = Confirmed(MINIMUM_CURRENT)
+        """Start without a reply."""
+        self.maximum = ConfirmedValue(MINIMUM_CURRENT)
         """Maximum of the connection, A; 6 A until two replies agree on more."""
-        self.interval = Confirmed(UNKNOWN_INTERVAL)
+        self.interval = ConfirmedValue(UNKNOWN_INTERVAL)
         """Minimum interval, s."""
-        self.minimum = Confirmed(MINIMUM_CURRENT)
+        self.minimum = ConfirmedValue(MINIMUM_CURRENT)
         """Smallest minimum required current of the modules, A."""
         self.meters = Meters()
-        self._held: list[_Seen] = []
-        self._believed: _Seen | None = None
+        self._quarantine: list[_Checked] = []
+        self._accepted: _Checked | None = None
+        """The last reply, if it was accepted although it was implausible."""
 
     @property
-    def held(self) -> int:
-        """Return how many consistent strange replies are held back."""
-        return len(self._held)
+    def quarantined(self) -> int:
+        """Return the number of consistent replies in quarantine."""
+        return len(self._quarantine)
 
     @property
-    def unsettled(self) -> bool:
-        """Return whether another reply is wanted soon to be sure."""
+    def unconfirmed(self) -> bool:
+        """Return whether another reply is needed soon to confirm a value."""
         return bool(
-            self._held
+            self._quarantine
             or self.maximum.rising
             or self.minimum.rising
             or self.interval.rising
-            or self.meters.settling
+            or self.meters.unconfirmed
         )
 
-    def forget(self) -> None:
-        """Forget what another box in this one's place would tell otherwise.
+    def reset(self) -> None:
+        """Drop the values that differ if another box has taken the place of this one.
 
-        The interval stays: a wrong one costs an unanswered request, no more. The
-        meters stay to be compared with.
+        The interval stays: a wrong one costs no more than an unanswered request. The
+        meters stay for comparison.
         """
-        self.maximum = Confirmed(MINIMUM_CURRENT)
-        self.minimum = Confirmed(MINIMUM_CURRENT)
-        self.meters.unsettle()
-        self._held.clear()
-        self._believed = None
+        self.maximum = ConfirmedValue(MINIMUM_CURRENT)
+        self.minimum = ConfirmedValue(MINIMUM_CURRENT)
+        self.meters.require_confirmation()
+        self._quarantine.clear()
+        self._accepted = None
 
-    def take(self, reply: Reply, now: float) -> Taken:
-        """Believe a reply, or raise ImplausibleReplyError and change nothing."""
-        carried = self._carried(reply)
-        odd: dict[Place, float] = range_oddities(reply, carried)
+    def accept(self, reply: Reply, now: float) -> AcceptedReply:
+        """Accept a reply received at this time (s).
+
+        Raises ImplausibleReplyError for one that is quarantined: no value changes.
+        """
+        highest = self._highest_current(reply)
+        implausible = implausible_values(reply, highest)
         totals = tuple(module.energy for module in reply.modules)
-        for index, total in self.meters.jumps(totals, now, carried).items():
-            odd[Oddity.METER, index, None] = total
-        seen = _Seen(reply, odd, Totals(totals, now))
-        if odd and not self._insists(seen, carried):
-            places = ", ".join(sorted({str(oddity) for oddity, _, _ in odd}))
-            message = f"a reply that cannot be ({places}) is held back"
+        for index, total in self.meters.jumps(totals, now, highest).items():
+            implausible[Quantity.METER, index, None] = total
+        checked = _Checked(reply, implausible, Totals(totals, now))
+        if implausible and not self._is_confirmed(checked, highest):
+            names = ", ".join(sorted({str(quantity) for quantity, _, _ in implausible}))
+            message = f"implausible reply quarantined ({names})"
             raise ImplausibleReplyError(message)
-        self._held.clear()
-        self._believed = seen if odd else None
-        return self._believe(seen, carried)
+        self._quarantine.clear()
+        self._accepted = checked if implausible else None
+        return self._update(checked, highest)
 
-    def _carried(self, reply: Reply) -> float:
-        """Return the highest used current of a phase that can be, A.
+    def _highest_current(self, reply: Reply) -> float:
+        """Return the highest used current of a phase that is plausible, A.
 
-        The higher of what is confirmed and what this reply says: cars need their
-        time to follow a maximum that was lowered.
+        From the confirmed maximum or that of this reply, whichever is higher: cars
+        need time to follow a maximum that was lowered.
         """
         maximum = self.maximum.value
         if reply.maximum_current <= LARGEST_CONNECTION:
             maximum = max(maximum, reply.maximum_current)
         return maximum * CURRENT_FACTOR + CURRENT_OFFSET
 
-    def _insists(self, seen: _Seen, carried: float) -> bool:
-        if self._believed is not None and _consistent(self._believed, seen, carried):
+    def _is_confirmed(self, checked: _Checked, highest: float) -> bool:
+        """Return whether enough replies agree with this one; else quarantine it."""
+        if self._accepted is not None and _consistent(self._accepted, checked, highest):
             return True
-        if self._held and not _consistent(self._held[-1], seen, carried):
-            self._held.clear()
-        self._held.append(seen)
-        return len(self._held) >= INSISTENCE
+        if self._quarantine and not _consistent(self._quarantine[-1], checked, highest):
+            self._quarantine.clear()
+        self._quarantine.append(checked)
+        return len(self._quarantine) >= CONFIRMATIONS
 
-    def _believe(self, seen: _Seen, carried: float) -> Taken:
-        reply = seen.reply
-        self.maximum.tell(reply.maximum_current)
-        self.interval.tell(reply.minimum_interval)
-        needed = min(
+    def _update(self, checked: _Checked, highest: float) -> AcceptedReply:
+        reply = checked.reply
+        self.maximum.update(reply.maximum_current)
+        self.interval.update(reply.minimum_interval)
+        smallest = min(
             (module.minimum_current for module in reply.modules),
             default=MINIMUM_CURRENT,
         )
-        self.minimum.tell(max(needed, MINIMUM_CURRENT))
-        shown = self.meters.take(seen.totals.totals, seen.totals.at, carried)
-        return Taken(
+        self.minimum.update(max(smallest, MINIMUM_CURRENT))
+        shown = self.meters.update(checked.totals.totals, checked.totals.at, highest)
+        return AcceptedReply(
             reply=reply,
             totals=shown,
             generations=tuple(map(self.meters.generation, range(len(shown)))),
-            oddities=seen.oddities,
+            implausible=checked.implausible,
         )
 
 
-def _consistent(first: _Seen, second: _Seen, carried: float) -> bool:
+def _consistent(first: _Checked, second: _Checked, highest: float) -> bool:
     if (
         len(first.reply.modules) != len(second.reply.modules)
         or first.reply.serial != second.reply.serial
-        or _fixed(first) != _fixed(second)
-        or bool(_over(first)) != bool(_over(second))
+        or _other_places(first) != _other_places(second)
+        or bool(_over_currents(first)) != bool(_over_currents(second))
     ):
         return False
-    common = _over(first) & _over(second)
-    if _over(first) and not common:
+    common = _over_currents(first) & _over_currents(second)
+    if _over_currents(first) and not common:
         return False
     return all(
-        first.totals.goes_on(place[1] or 0, int(value), second.totals.at, carried)
-        if place[0] is Oddity.METER
-        else _near(place[0], first.oddities[place], value)
-        for place, value in second.oddities.items()
-        if place in common or place[0] is not Oddity.CURRENT
+        first.totals.can_grow_to(place[1] or 0, int(value), second.totals.at, highest)
+        if place[0] is Quantity.METER
+        else _agree(place[0], first.implausible[place], value)
+        for place, value in second.implausible.items()
+        if place in common or place[0] is not Quantity.CURRENT
     )
 
 
-def _over(seen: _Seen) -> set[Place]:
-    return {place for place in seen.oddities if place[0] is Oddity.CURRENT}
+def _over_currents(checked: _Checked) -> set[Place]:
+    return {place for place in checked.implausible if place[0] is Quantity.CURRENT}
 
 
-def _fixed(seen: _Seen) -> set[Place]:
-    return set(seen.oddities) - _over(seen)
+def _other_places(checked: _Checked) -> set[Place]:
+    return set(checked.implausible) - _over_currents(checked)
 
 
-def _near(oddity: Oddity, one: float, two: float) -> bool:
-    share, amount = _AGREEMENT[oddity]
+def _agree(quantity: Quantity, one: float, two: float) -> bool:
+    share, amount = _AGREEMENT[quantity]
     return abs(one - two) <= amount + share * max(abs(one), abs(two))

@@ -1,12 +1,12 @@
-"""Finding ChargePoints. There is no read: a probe sets limits.
+"""Search for ChargePoints. There is no read: a probe sets limits.
 
-What is imposed is what the user has confirmed, through the same clamp as always:
-6 A at most, because no maximum is known yet.
+A probe sends the orders that the user has confirmed, through the same clamp as any
+request: at most 6 A, because no maximum is known yet.
 
-Serial 0 (and command 69) addresses every ChargePoint at once. The silence rule
-lets several of them answer one after the other, so a probe listens for as long
-as answers keep coming; where they talk at the same time, nobody can read them,
-and their serial numbers have to be typed.
+Serial number 0 (and command 69) addresses all ChargePoints at once. By the rule of
+silence several of them may reply one after the other, so a probe listens for as long
+as replies come. If they reply at the same time the frames are unreadable, and the
+serial numbers must be typed in.
 """
 
 import asyncio
@@ -20,28 +20,27 @@ from ..exchange import Turn
 from ..model import Limits, Orders
 from ..protocol import Progress
 from ..scan import FoundCharger, ScanResult
-from .config import EvboxConfig
+from .charger import encode_request, setpoint_for
+from .config import INTERVAL_MARGIN, UNKNOWN_INTERVAL, EvboxConfig
 from .frames import ANY_SERIAL, EvboxFrame, Reply, decode_reply
-from .plausibility import range_oddities
-from .reading import charger_info, serial_number
-from .request import encode, wire_setpoint
-from .timing import INTERVAL_MARGIN, UNKNOWN_INTERVAL
+from .plausibility import implausible_values
+from .readings import charger_info, serial_number
 
 TRIES: Final = 2
 RETRY_PAUSE = UNKNOWN_INTERVAL + INTERVAL_MARGIN
-"""Between two tries, s. A ChargePoint may have heard the first one without being
-understood, and what it does with a second one too soon is not in the manual."""
+"""Between two tries, s. A ChargePoint may have received the first one although its
+reply was unreadable, and its reaction to a second one too soon is not documented."""
 _PROGRESS_STEP: Final = 0.5
 """s"""
 
 
 @dataclass(slots=True)
-class _Heard:
-    """What came back from one probe."""
+class _Answers:
+    """Everything received after one probe."""
 
     replies: list[Reply] = field(default_factory=list)
     bad_frames: bool = False
-    """Frames that nobody can read: several at once, or a bad line."""
+    """There were unreadable frames: several at once, or a bad line."""
     noise: bool = False
 
     @property
@@ -52,11 +51,11 @@ class _Heard:
 async def scan(
     bus: Bus, config: EvboxConfig, orders: Orders, progress: Progress
 ) -> ScanResult:
-    """Impose these orders on whoever is addressed, and report who answers.
+    """Send these orders to the addressed ChargePoints, and return those that reply.
 
-    Takes one second where somebody answers, 23 s where nobody does. Raises
-    RefusedOrderError for orders that cannot be sent, and for a probe of everybody
-    on a bus that has chargers already; LineError when the line will not do.
+    Takes one second with a reply, 23 s without. Raises RefusedOrderError for orders
+    that cannot be sent, and for a probe of all ChargePoints on a bus that has chargers
+    already; LineError when the line cannot be used.
     """
     if config.addressed == ANY_SERIAL and bus.chargers:
         message = (
@@ -65,16 +64,16 @@ async def scan(
         )
         raise RefusedOrderError(message)
     limits = Limits(installation=config.installation_limit, reports_maximum=True)
-    request = encode(config, wire_setpoint(orders, limits, UNKNOWN_INTERVAL))
-    heard = _Heard()
+    request = encode_request(config, setpoint_for(orders, limits, UNKNOWN_INTERVAL))
+    answers = _Answers()
     for number in range(TRIES):
         if number:
             await _pause(progress)
-        heard = await bus.run(partial(_probe, bus, config, request))
-        if heard.replies:
+        answers = await bus.run(partial(_probe, bus, config, request))
+        if answers.replies:
             break
     progress(1.0)
-    return _report(config, heard)
+    return _result(config, answers)
 
 
 async def _pause(progress: Progress) -> None:
@@ -85,8 +84,8 @@ async def _pause(progress: Progress) -> None:
         await asyncio.sleep(min(_PROGRESS_STEP, RETRY_PAUSE - passed))
 
 
-async def _probe(bus: Bus, config: EvboxConfig, request: bytes, turn: Turn) -> _Heard:
-    heard = _Heard()
+async def _probe(bus: Bus, config: EvboxConfig, request: bytes, turn: Turn) -> _Answers:
+    answers = _Answers()
 
     def collect(frame: EvboxFrame) -> None:
         reply = decode_reply(frame)
@@ -94,46 +93,46 @@ async def _probe(bus: Bus, config: EvboxConfig, request: bytes, turn: Turn) -> _
             return
         if config.addressed and reply.serial != f"{config.addressed:08d}":
             return
-        if range_oddities(reply):
-            heard.bad_frames = True
-        elif reply not in heard.replies:
-            heard.replies.append(reply)
+        if implausible_values(reply):
+            answers.bad_frames = True
+        elif reply not in answers.replies:
+            answers.replies.append(reply)
 
     bad = bus.wire.statistics.bad_frames
     try:
-        # Nothing is taken for the answer: whoever else has one to give is waited for.
+        # No frame ends the exchange, so that all ChargePoints have time to reply.
         await turn.exchange(request, collect)
     except GarbledReplyError:
         if bus.wire.statistics.bad_frames > bad:
-            heard.bad_frames = True
+            answers.bad_frames = True
         else:
-            heard.noise = True
+            answers.noise = True
     except ReplyTimeoutError:
         pass
-    return heard
+    return answers
 
 
-def _report(config: EvboxConfig, heard: _Heard) -> ScanResult:
+def _result(config: EvboxConfig, answers: _Answers) -> ScanResult:
     found: dict[int, FoundCharger] = {}
     duplicates: set[int] = set()
-    for reply in heard.replies:
+    for reply in answers.replies:
         address = _address(config, reply)
         if address in found:
             duplicates.add(address)
         else:
             found[address] = _found(address, reply)
-    if heard.bad_frames and config.addressed == ANY_SERIAL:
+    if answers.bad_frames and config.addressed == ANY_SERIAL:
         duplicates.add(ANY_SERIAL)
     return ScanResult(
         found=tuple(found[address] for address in sorted(found.keys() - duplicates)),
         duplicates=tuple(sorted(duplicates)),
-        unreadable=heard.unreadable,
+        unreadable=answers.unreadable,
     )
 
 
 def _address(config: EvboxConfig, reply: Reply) -> int:
     serial = serial_number(reply)
-    # A serial number that is no number cannot be addressed.
+    # A serial number that is not decimal cannot be addressed.
     return int(serial) if serial and serial.isdecimal() else config.address
 
 

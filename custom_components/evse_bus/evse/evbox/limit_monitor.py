@@ -1,4 +1,4 @@
-"""Watching whether a ChargePoint keeps to the limits we sent."""
+"""Check that a ChargePoint keeps to the limits sent to it."""
 
 from collections import deque
 from math import inf
@@ -8,26 +8,26 @@ from ..model import Phases
 
 TOLERANCE_SHARE: Final = 0.05
 TOLERANCE: Final = 1.0
-"""Used currents may stand this much above the limit (meters, rounding), A."""
+"""Used currents may be this much above the limit (meters, rounding), A."""
 READINGS: Final = 2
-"""Readings in a row that must show it: a car may overshoot for a moment."""
+"""Readings in a row that must be above it: a car may overshoot for a moment."""
 _NO_LIMIT: Final[Phases[float]] = (inf, inf, inf)
 
 
-class LimitWatch:
+class LimitMonitor:
     """Compares used currents with the limits of the last seconds.
 
-    A car may take some seconds to follow, so a reading is held against the highest
+    A car may take some seconds to follow, so a reading is compared with the highest
     limit that was in force within that time.
     """
 
     def __init__(self) -> None:
-        """Know of no limit: what the box did before us is its own affair."""
+        """Start without a limit: earlier ones are not known."""
         self._limits: deque[tuple[float, Phases[float]]] = deque([(-inf, _NO_LIMIT)])
         self._above = 0
 
     def sent(self, now: float, currents: Phases[float], *, answered: bool) -> None:
-        """Note what was sent, A; unanswered, it may be in force or not."""
+        """Record limits that were sent (A); unanswered, they may be in force or not."""
         if not answered:
             one, two, three = map(max, self._limits[-1][1], currents, strict=True)
             currents = (one, two, three)
@@ -35,8 +35,11 @@ class LimitWatch:
             self._limits.append((now, currents))
 
     def exceeded(self, now: float, used: Phases[float], grace: float) -> bool:
-        """Return whether more is used than was allowed within ``grace`` seconds."""
-        # The limit that was in force when the grace began still counts.
+        """Return whether used currents (A) exceed every limit of the last ``grace`` s.
+
+        True from the second such reading in a row.
+        """
+        # The limit in force at the beginning of that time counts too.
         while len(self._limits) > 1 and self._limits[1][0] <= now - grace:
             self._limits.popleft()
         allowed = (

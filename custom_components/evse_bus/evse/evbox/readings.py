@@ -1,4 +1,4 @@
-"""From a believed reply to the neutral model."""
+"""Conversion of an accepted reply to the neutral model."""
 
 from collections.abc import Mapping
 from typing import Final
@@ -6,7 +6,7 @@ from typing import Final
 from ..model import UNKNOWN_PHASES, Phases
 from ..readings import ChargerInfo, ConnectorReading
 from .frames import ModuleReply, Reply
-from .plausibility import Taken
+from .plausibility import AcceptedReply
 
 CHARGING_CURRENT: Final = 0.5
 """A module charges when a phase carries this much, A: the wire has no state, a car
@@ -14,7 +14,7 @@ draws 6 A or more, and a box and a sleeping car draw some tenths."""
 
 
 def serial_number(reply: Reply) -> str | None:
-    """Return the serial number as people write it; ``None``: not told."""
+    """Return the serial number without leading zeros; ``None``: not reported."""
     if reply.serial is None:
         return None
     return reply.serial.lstrip("0") or None
@@ -26,19 +26,27 @@ def same_serial(one: str, two: str) -> bool:
 
 
 def charger_info(serial: str | None) -> ChargerInfo:
-    """Return what a ChargePoint is: the wire tells its serial number at most."""
+    """Return the identity of a ChargePoint: at most its serial number is reported."""
     return ChargerInfo(manufacturer="EVBox", model="ChargePoint", serial=serial)
 
 
-def connectors(taken: Taken, voltage: float) -> Mapping[int, ConnectorReading]:
-    """Return what is known of each module, by its number from 1.
+def connectors(
+    accepted: AcceptedReply, voltage: float
+) -> Mapping[int, ConnectorReading]:
+    """Return the reading of each module, by its number from 1.
 
-    ``voltage`` is for estimates where the wire tells none (69), V.
+    ``voltage``, V: for estimates where the wire has none (69).
     """
     return {
         number: _connector(module, total, generation, voltage)
         for number, (module, total, generation) in enumerate(
-            zip(taken.reply.modules, taken.totals, taken.generations, strict=True), 1
+            zip(
+                accepted.reply.modules,
+                accepted.totals,
+                accepted.generations,
+                strict=True,
+            ),
+            1,
         )
     }
 
@@ -64,7 +72,7 @@ def _connector(
 
 
 def _voltages(module: ModuleReply) -> Phases[float | None]:
-    """Return measured voltages; 0 V on a phase in use means that none is measured."""
+    """Return measured voltages, V; 0 V on a phase in use means not measured."""
     if module.voltages is None or not any(module.voltages):
         return UNKNOWN_PHASES
     one, two, three = (
@@ -75,10 +83,10 @@ def _voltages(module: ModuleReply) -> Phases[float | None]:
 
 
 def _power(module: ModuleReply, voltages: Phases[float | None]) -> float | None:
-    """Return the sum of U * I * cos phi, W; ``None``: a voltage is not known.
+    """Return the sum of U * I * cos phi, W; ``None``: a voltage is unknown.
 
     A phase without current adds nothing, whatever its voltage. The sign of cos phi
-    says which way the current lags, not that a car feeds back.
+    is that of the phase shift; it does not mean that a car feeds back.
     """
     power = 0.0
     for voltage, current, cos_phi in zip(
