@@ -1,7 +1,7 @@
 """Virtual ChargePoints on a wire in simulated time.
 
-The ChargePoints are those of `tests.virtual`: they judge what they hear by the
-manual, share no code with the library, and know no other time than this wire's.
+The ChargePoints are those of `tests.virtual`: they check requests by the manual, share
+no code with the library, and take their time from this wire.
 """
 
 import asyncio
@@ -28,15 +28,15 @@ FOREIGN = "foreign"
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """What the library put on the wire."""
+    """A request that the library sent."""
 
     at: float
-    """When the last byte had left, s."""
+    """Loop time at which the last byte had left, s."""
     order: Order
 
 
 class Ether(Line):
-    """A wire with ChargePoints; also the bus that these believe to be on."""
+    """A wire with ChargePoints; for these it stands in for their bus."""
 
     def __init__(self, *points: EvboxChargePoint) -> None:
         super().__init__("ether", PROTOCOL.settings)
@@ -48,9 +48,9 @@ class Ether(Line):
         self.rng = Random(1)  # noqa: S311 - repeatable on purpose
         self.byte_time = self.settings.byte_time
         self.damage: Callable[[bytes], bytes] = lambda data: data
-        """What becomes of bytes on their way to the library."""
+        """Changes bytes on their way to the library."""
         self.watch: Callable[[Order], None] = lambda _order: None
-        """Called with each request in the moment it is sent."""
+        """Called with each request at the moment it is sent."""
         self._open = False
         self._idle_from = -1000.0
 
@@ -82,9 +82,9 @@ class Ether(Line):
     def write(self, data: bytes, *, reply_may_equal: bool = False) -> float:
         end = now() + len(data) * self.byte_time
         body = checked(data[1:-1].decode())
-        assert body is not None, "the checksums of a request"
+        assert body is not None, "wrong checksums"
         request = order(body, end)
-        assert request is not None, "a request as the manual has it"
+        assert request is not None, "not a request of the manual"
         self.watch(request)
         self.sent.append(Sent(end, request))
         self._put(data, CLIENT)
@@ -98,9 +98,9 @@ class Ether(Line):
         silence = start - self._idle_from
         self._idle_from = start + len(data) * self.byte_time
         segment = Segment(start, self.byte_time, data, (source,), silence)
-        asyncio.get_running_loop().call_at(self._idle_from, self._heard, segment)
+        asyncio.get_running_loop().call_at(self._idle_from, self._deliver, segment)
 
-    def _heard(self, segment: Segment) -> None:
+    def _deliver(self, segment: Segment) -> None:
         (source,) = segment.sources
         if source != CLIENT and self._open:
             self.last_activity = max(self.last_activity, now())
@@ -110,18 +110,18 @@ class Ether(Line):
                 point.hear(segment)
 
     def foreign(self, data: bytes) -> None:
-        """Let somebody else speak now."""
+        """Send bytes of another station now."""
         self._put(data, FOREIGN)
 
-    # -- What a ChargePoint uses of its bus
+    # -- The part of a bus that a ChargePoint uses
 
     def time(self) -> float:
         return now()
 
     now = time
 
-    def call[T](self, what: Callable[[], T]) -> T:
-        return what()
+    def call[T](self, function: Callable[[], T]) -> T:
+        return function()
 
     def send_after_silence(
         self, device: EvboxChargePoint, data: bytes, at: float, silence: float
@@ -134,7 +134,7 @@ class Ether(Line):
             start, self.send_after_silence, device, data, at, silence
         )
 
-    # -- The witness
+    # -- For assertions
 
     @property
     def orders(self) -> list[Order]:
@@ -186,18 +186,18 @@ class Scene:
             assert point.counters.zero_timeouts == 0
 
 
-async def until(what: Callable[[], object], limit: float = 300.0) -> None:
-    """Wait in simulated time for something to become true."""
+async def until(condition: Callable[[], object], limit: float = 300.0) -> None:
+    """Wait in simulated time until a condition is true."""
     end = now() + limit
-    while not what():
+    while not condition():
         assert now() < end, "it did not happen"
         await asyncio.sleep(0.01)
 
 
 @contextmanager
 def updates(charger: EvboxCharger) -> Iterator[list[int]]:
-    """Count what listeners hear."""
-    heard: list[int] = []
-    stop = charger.subscribe(lambda: heard.append(1))
-    yield heard
+    """Count the calls of a listener."""
+    calls: list[int] = []
+    stop = charger.subscribe(lambda: calls.append(1))
+    yield calls
     stop()

@@ -1,4 +1,4 @@
-"""Replies made by hand, for the tests of what is believed."""
+"""Replies for the tests of plausibility and readings."""
 
 from custom_components.evse_bus.evse.evbox.frames import ModuleReply, Reply
 

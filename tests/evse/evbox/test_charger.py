@@ -1,4 +1,4 @@
-"""A ChargePoint's conversation, in simulated time."""
+"""Conversations with a ChargePoint, in simulated time."""
 
 import asyncio
 from dataclasses import replace
@@ -42,7 +42,7 @@ def six(ether: Ether) -> list[bool]:
     return [max(order.limits + order.fallback) <= 6.0 for order in ether.orders]
 
 
-# -- Set-up --------------------------------------------------------------------------
+# -- Configuration -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -54,19 +54,21 @@ def six(ether: Ether) -> list[bool]:
         {"information": bytes(15)},
     ],
 )
-def test_a_set_up_that_cannot_be_sent_is_refused(values: dict[str, Any]) -> None:
+def test_a_configuration_that_cannot_be_encoded_is_refused(
+    values: dict[str, Any],
+) -> None:
     config = EvboxConfig(key="a", name="A", address=1)
     with pytest.raises(ValueError, match=r"68|digits|16"):
         replace(config, **values)
 
 
-def test_another_protocols_set_up_is_refused() -> None:
+def test_the_configuration_of_another_protocol_is_refused() -> None:
     charger = EvboxCharger(EvboxConfig(key="a", name="A", address=1), ORDERS)
     with pytest.raises(TypeError, match="EvboxConfig"):
         charger.reconfigure(ChargerConfig(key="a", name="A", address=1))
 
 
-def test_what_each_command_has() -> None:
+def test_the_capabilities_of_each_command() -> None:
     one = EvboxCharger(EvboxConfig(key="a", name="A", address=1), ORDERS)
     two = EvboxCharger(EvboxConfig(key="a", name="A", address=1, command=69), ORDERS)
     assert one.capabilities - two.capabilities == {
@@ -78,10 +80,10 @@ def test_what_each_command_has() -> None:
         assert absent not in one.capabilities | two.capabilities
 
 
-# -- Imposing and reading ------------------------------------------------------------
+# -- Orders and readings -------------------------------------------------------------
 
 
-def test_from_the_first_message_to_the_reading() -> None:
+def test_from_the_first_request_to_the_reading() -> None:
     async def scene() -> None:
         car = Car(max_current=10.0, phases=1, cos_phi=0.9)
         point = box(Module(car, energy_wh=5000), Module(min_current=8.0))
@@ -114,7 +116,7 @@ def test_from_the_first_message_to_the_reading() -> None:
             assert reading.details == {
                 "command": 68,
                 "modules": 2,
-                "told_maximum_current": 35.0,
+                "reported_maximum_current": 35.0,
                 "ordered_timeout": 60,
                 "effective_timeout": 60,
                 "sent_currents": "16 / 16 / 16",
@@ -216,7 +218,7 @@ def test_no_modules_and_twenty_modules() -> None:
     simulate(scene())
 
 
-def test_a_module_that_comes_or_goes_and_its_meter() -> None:
+def test_the_meters_when_a_module_is_removed() -> None:
     async def scene() -> None:
         point = box(Module(energy_wh=5000), Module(energy_wh=70_000))
         async with Scene.of(point) as stage:
@@ -243,7 +245,7 @@ def test_a_module_that_comes_or_goes_and_its_meter() -> None:
     simulate(scene())
 
 
-# -- When ----------------------------------------------------------------------------
+# -- Times ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("interval", [0, 1, 2, 20])
@@ -258,7 +260,7 @@ def test_the_minimum_interval_is_kept_also_by_commands(interval: int) -> None:
                 assert stage.ether.orders[-1].limits[0] == current
                 await asyncio.sleep(0.3)
             assert charger.minimum_interval == interval
-        # The first ones are sent before anything is told.
+        # The first requests are sent before a minimum interval is known.
         assert min(stage.ether.pauses()) >= max(interval, 0.2)
         assert point.counters.too_soon == 0
 
@@ -291,21 +293,21 @@ def test_the_period(poll: float, interval: int, timeout: int, period: float) -> 
 
 
 @pytest.mark.parametrize(
-    ("interval", "asked", "sent"),
+    ("interval", "ordered", "sent"),
     [(20, 5, 60), (1, 1, 3), (0, 1, 3), (1, 600, 600), (20, 0xFFFF, 0xFFFF)],
 )
 def test_a_time_out_below_three_intervals_is_raised(
-    interval: int, asked: int, sent: int
+    interval: int, ordered: int, sent: int
 ) -> None:
     async def scene() -> None:
         async with Scene.of(box(min_interval=interval)) as stage:
-            charger = stage.add(orders=replace(ORDERS, fail_safe_timeout=asked))
-            assert charger.effective_timeout == max(asked, 60)
+            charger = stage.add(orders=replace(ORDERS, fail_safe_timeout=ordered))
+            assert charger.effective_timeout == max(ordered, 60)
             await asyncio.sleep(100.0)
             assert charger.effective_timeout == sent
             assert stage.ether.orders[-1].timeout == sent
             assert charger.reading is not None
-            assert charger.reading.details["ordered_timeout"] == asked
+            assert charger.reading.details["ordered_timeout"] == ordered
             assert charger.reading.details["effective_timeout"] == sent
 
     simulate(scene())
@@ -318,16 +320,16 @@ def test_a_short_time_out_leaves_room_for_commands() -> None:
             charger = stage.add(orders=replace(ORDERS, fail_safe_timeout=1))
             await asyncio.sleep(10.0)
             for current in (10.0, 12.0, 14.0):
-                asked = now()
+                started = now()
                 await charger.change_orders(OrderChange(current=current))
-                assert now() - asked < 1.6
+                assert now() - started < 1.6
                 await asyncio.sleep(5.0)
         assert point.counters.fail_backs == 0
 
     simulate(scene())
 
 
-def test_lost_answers_are_asked_for_again_before_the_time_out() -> None:
+def test_unanswered_requests_are_repeated_before_the_time_out() -> None:
     async def scene() -> None:
         point = box(min_interval=1)
         async with Scene.of(point) as stage:
@@ -344,7 +346,7 @@ def test_lost_answers_are_asked_for_again_before_the_time_out() -> None:
     simulate(scene())
 
 
-def test_a_deadline_stands_until_the_box_is_gone() -> None:
+def test_a_deadline_stands_until_the_box_is_unavailable() -> None:
     async def scene() -> None:
         point = box()
         async with Scene.of(point) as stage:
@@ -355,9 +357,9 @@ def test_a_deadline_stands_until_the_box_is_gone() -> None:
             await until(lambda: charger.misses == 1)
             assert charger.available
             assert charger.slot.ready < charger.slot.start_by < inf
-            with updates(charger) as heard:
+            with updates(charger) as calls:
                 await until(lambda: not charger.available)
-            assert len(heard) == 1
+            assert len(calls) == 1
             assert (charger.reading, charger.slot.start_by) == (None, inf)
             assert charger.slot.kind is Kind.PROBE
 
@@ -385,7 +387,7 @@ def test_it_falls_back_when_we_stop_and_not_before() -> None:
     simulate(scene())
 
 
-def test_after_an_absence_6_a_and_then_what_stands() -> None:
+def test_after_an_absence_6_a_and_then_the_orders_that_stand() -> None:
     async def scene() -> None:
         point = box()
         async with Scene.of(point) as stage:
@@ -400,7 +402,7 @@ def test_after_an_absence_6_a_and_then_what_stands() -> None:
             point.power_cycle()
             await until(lambda: charger.available)
             assert all(six(stage.ether)[silent:])
-            # Not left alone for long: it charges as it likes until it hears us.
+            # No longer pause: it charges at its own maximum until a request comes.
             assert max(stage.ether.pauses()) < 12.0
             await asyncio.sleep(5.0)
             assert stage.ether.orders[-1].limits == (16.0, 16.0, 16.0)
@@ -454,7 +456,7 @@ def test_expired_orders_stay_so_while_the_fail_safe_changes() -> None:
     simulate(scene())
 
 
-# -- What is not believed ------------------------------------------------------------
+# -- Implausible replies --------------------------------------------------------------
 
 
 def test_a_stray_wrong_value_is_never_shown() -> None:
@@ -473,9 +475,9 @@ def test_a_stray_wrong_value_is_never_shown() -> None:
             )
             for number, lie in enumerate(lies, 1):
                 point.lie(**lie)
-                with updates(charger) as heard:
+                with updates(charger) as calls:
                     await asyncio.sleep(10.0)
-                assert heard == []
+                assert calls == []
                 assert charger.reading == before
                 assert charger.statistics.implausible == number
                 assert charger.available
@@ -483,7 +485,7 @@ def test_a_stray_wrong_value_is_never_shown() -> None:
     simulate(scene())
 
 
-def test_strange_values_that_stay_are_shown_with_a_fault() -> None:
+def test_implausible_values_that_stay_are_shown_with_a_fault() -> None:
     async def scene() -> None:
         point = box(Module(energy_wh=5000))
         async with Scene.of(point) as stage:
@@ -520,7 +522,7 @@ def test_a_real_over_current_is_shown() -> None:
     simulate(scene())
 
 
-def test_a_box_that_contradicts_itself_becomes_unavailable() -> None:
+def test_inconsistent_implausible_replies_make_it_unavailable() -> None:
     async def scene() -> None:
         point = box()
         async with Scene.of(point) as stage:
@@ -534,7 +536,7 @@ def test_a_box_that_contradicts_itself_becomes_unavailable() -> None:
             assert not charger.available
             assert charger.reading is None
             assert Fault.IMPLAUSIBLE in charger.faults
-            # It is there, and what stands is still imposed, with 6 A at most.
+            # It is there, so its orders are still sent, with 6 A at most.
             assert six(stage.ether)[-1]
             assert point.counters.fail_backs == 0
             await asyncio.sleep(10.0)
@@ -544,7 +546,7 @@ def test_a_box_that_contradicts_itself_becomes_unavailable() -> None:
     simulate(scene())
 
 
-def test_a_limit_that_is_not_kept_is_noticed() -> None:
+def test_a_limit_that_is_not_kept_is_a_fault() -> None:
     async def scene() -> None:
         car = Car(max_current=32.0, greedy=1.3)
         point = box(Module(car))
@@ -562,7 +564,7 @@ def test_a_limit_that_is_not_kept_is_noticed() -> None:
     simulate(scene())
 
 
-def test_a_car_that_takes_its_time_is_no_fault() -> None:
+def test_a_car_that_follows_slowly_is_no_fault() -> None:
     async def scene() -> None:
         car = Car(max_current=32.0, reaction=9.0, ramp=1.0)
         car.plug_in()
@@ -580,7 +582,7 @@ def test_a_car_that_takes_its_time_is_no_fault() -> None:
     simulate(scene())
 
 
-def test_a_command_is_repeated_until_its_answer_is_believed() -> None:
+def test_a_command_is_repeated_until_its_reply_is_accepted() -> None:
     async def scene() -> None:
         point = box(Module(energy_wh=5000))
         async with Scene.of(point) as stage:
@@ -594,7 +596,7 @@ def test_a_command_is_repeated_until_its_answer_is_believed() -> None:
     simulate(scene())
 
 
-def test_a_command_that_nobody_answers_fails_and_a_lowering_stands() -> None:
+def test_an_unanswered_command_fails_and_a_lowering_stands() -> None:
     async def scene() -> None:
         point = box()
         async with Scene.of(point) as stage:
@@ -615,10 +617,10 @@ def test_a_command_that_nobody_answers_fails_and_a_lowering_stands() -> None:
     simulate(scene())
 
 
-# -- Other people on the wire --------------------------------------------------------
+# -- Other stations on the line -------------------------------------------------------
 
 
-def test_others_are_not_taken_for_ours() -> None:
+def test_replies_of_other_chargepoints_are_ignored() -> None:
     async def scene() -> None:
         point = box(Module(energy_wh=5000))
         other = EvboxChargePoint(77, [Module(energy_wh=9), Module()])
@@ -627,11 +629,11 @@ def test_others_are_not_taken_for_ours() -> None:
             await asyncio.sleep(10.0)
             before = charger.reading
 
-            def meanwhile(data: bytes) -> bytes:
+            def add_other_frames(data: bytes) -> bytes:
                 foreign = frame("A0806800000077000101F40000000000"[:22] + "00")
                 return foreign + frame("BCA001") + frame("A080690001015E00") + data
 
-            stage.ether.damage = meanwhile
+            stage.ether.damage = add_other_frames
             await asyncio.sleep(20.0)
             assert charger.reading == before
             assert charger.statistics.timeouts == 0
@@ -640,7 +642,7 @@ def test_others_are_not_taken_for_ours() -> None:
     simulate(scene())
 
 
-def test_two_chargepoints_by_serial_number() -> None:
+def test_three_chargepoints_by_serial_number() -> None:
     async def scene() -> None:
         points = [EvboxChargePoint(serial, serial % 10) for serial in (11, 12, 13)]
         async with Scene.of(*points) as stage:
@@ -659,7 +661,7 @@ def test_two_chargepoints_by_serial_number() -> None:
     simulate(scene())
 
 
-def test_eight_of_twenty_modules_each_miss_no_deadline() -> None:
+def test_eight_chargepoints_of_twenty_modules_miss_no_deadline() -> None:
     async def scene() -> None:
         points = [EvboxChargePoint(serial, 20) for serial in range(1, 9)]
         async with Scene.of(*points) as stage:
@@ -678,7 +680,7 @@ def test_eight_of_twenty_modules_each_miss_no_deadline() -> None:
 # -- Another box in its place --------------------------------------------------------
 
 
-def test_a_swapped_box_gets_two_messages_of_6_a_and_no_more() -> None:
+def test_a_swapped_box_gets_two_requests_of_6_a_and_no_more() -> None:
     async def scene() -> None:
         point = box()
         async with Scene.of(point) as stage:
@@ -688,14 +690,14 @@ def test_a_swapped_box_gets_two_messages_of_6_a_and_no_more() -> None:
             assert charger.info.serial == "1923054"
             assert not six(stage.ether)[-1]
             sent = len(stage.ether.sent)
-            # Off, changed, and on again.
+            # Switched off, replaced, and switched on again.
             point.faults.dead = True
             await until(lambda: not charger.available)
             missed = len(stage.ether.sent) - sent
             point.serial, point.faults.dead = "00000077", False
-            with updates(charger) as heard:
+            with updates(charger) as calls:
                 await until(lambda: charger.faults)
-            assert heard
+            assert calls
             assert charger.faults == {Fault.WRONG_CHARGER}
             assert (charger.available, charger.reading) == (False, None)
             assert charger.info.serial == "1923054"
@@ -712,7 +714,7 @@ def test_a_swapped_box_gets_two_messages_of_6_a_and_no_more() -> None:
     simulate(scene())
 
 
-def test_a_box_swapped_while_nobody_looked_gets_6_a() -> None:
+def test_a_box_swapped_between_two_polls_gets_6_a() -> None:
     async def scene() -> None:
         point = box()
         async with Scene.of(point) as stage:
@@ -728,7 +730,7 @@ def test_a_box_swapped_while_nobody_looked_gets_6_a() -> None:
     simulate(scene())
 
 
-def test_the_serial_number_set_up_is_the_one_that_counts() -> None:
+def test_the_configured_serial_number_counts() -> None:
     async def scene() -> None:
         async with Scene.of(box()) as stage:
             charger = stage.add(0, serial="77")
@@ -744,7 +746,7 @@ def test_the_serial_number_set_up_is_the_one_that_counts() -> None:
     simulate(scene())
 
 
-def test_one_damaged_serial_number_stops_nothing() -> None:
+def test_one_corrupt_serial_number_stops_nothing() -> None:
     async def scene() -> None:
         point = box()
         async with Scene.of(point) as stage:
@@ -762,18 +764,18 @@ def test_one_damaged_serial_number_stops_nothing() -> None:
     simulate(scene())
 
 
-def test_addressed_by_its_serial_number_another_box_hears_nothing() -> None:
+def test_addressed_by_serial_number_another_box_gets_no_request() -> None:
     async def scene() -> None:
         point = box()
         async with Scene.of(point) as stage:
             charger = stage.add()
             await asyncio.sleep(10.0)
-            heard = len(point.orders)
+            received = len(point.orders)
             point.serial = "00000077"
             await asyncio.sleep(60.0)
             assert not charger.available
             assert charger.faults == frozenset()
-            assert len(point.orders) == heard
+            assert len(point.orders) == received
             point.serial = "01923054"
             await asyncio.sleep(30.0)
             assert charger.available

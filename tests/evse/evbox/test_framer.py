@@ -1,4 +1,4 @@
-"""Frames found in whatever comes."""
+"""Frames in any sequence of bytes."""
 
 from itertools import pairwise
 
@@ -46,10 +46,10 @@ def test_wrong_checksums_are_counted() -> None:
     assert framer.bad == 1
 
 
-def test_what_is_not_hex_and_what_is_too_short_is_counted() -> None:
+def test_frames_that_are_not_hex_or_too_short_are_counted() -> None:
     for text in (b"", b"80A0", b"\xff" * 20, b"80A06\x8000"):
         assert feed(b"\x02" + text + b"\x03")[1].bad == 1
-    # Wrong, but not by its checksums.
+    # Its checksums are good.
     assert feed(frame("Z0A069"))[1].bad == 1
 
 
@@ -63,7 +63,7 @@ def test_an_overlong_frame_is_dropped_and_the_next_one_found() -> None:
         assert framer.noise == LONGEST_FRAME + 2
 
 
-def test_a_reset_forgets_the_half_frame() -> None:
+def test_a_reset_drops_the_half_frame() -> None:
     framer = EvboxFramer()
     framer.feed(GOOD[:10])
     assert framer.pending == 10
@@ -94,7 +94,7 @@ pieces = st.lists(
 
 @given(pieces, st.lists(st.integers(0, 3000), max_size=8))
 @example([b"\x02" + b"0" * LONGEST_FRAME, b"\x02"], [LONGEST_FRAME])
-def test_how_bytes_are_cut_up_makes_no_difference(
+def test_the_chunks_of_bytes_make_no_difference(
     parts: list[bytes], cuts: list[int]
 ) -> None:
     wire = b"".join(parts)
@@ -112,7 +112,7 @@ def test_a_whole_frame_after_any_noise_is_found(noise: bytes) -> None:
 
 
 @given(st.binary(max_size=200))
-def test_no_bytes_make_it_fail(data: bytes) -> None:
+def test_no_bytes_raise(data: bytes) -> None:
     framer = EvboxFramer()
     for one in framer.feed(b"\x02" + data + b"\x03"):
         decode_reply(one)

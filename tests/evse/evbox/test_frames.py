@@ -1,4 +1,4 @@
-"""Byte vectors of the manual, of PROTOCOLS.md, and of a real box; every decoder."""
+"""Byte vectors of the manual, of PROTOCOLS.md and of a real box."""
 
 from hypothesis import given, strategies as st
 import pytest
@@ -19,7 +19,7 @@ from custom_components.evse_bus.evse.evbox.frames import (
 )
 from custom_components.evse_bus.evse.model import CurrentLimit, Limits, Orders
 from custom_components.evse_bus.evse.safety import Setpoint, clamp
-from tests.virtual import evbox_frames as witness
+from tests.virtual import evbox_frames as oracle
 
 ORDER = "00E6008C0154003C002800500046"
 REQUEST_69 = b"\x0280A069" + ORDER.encode() + b"F703\x03"
@@ -86,7 +86,7 @@ def test_command_68_with_computed_checksums(third: float, word: str, sums: str) 
 
 
 @pytest.mark.parametrize("serial", [-1, 100_000_000])
-def test_a_serial_number_that_has_no_eight_digits(serial: int) -> None:
+def test_a_serial_number_that_does_not_fit_eight_digits(serial: int) -> None:
     with pytest.raises(ValueError, match="8 digits"):
         encode_68(manual_setpoint(), serial=serial, information=INFORMATION)
 
@@ -97,7 +97,7 @@ def test_an_information_module_of_another_length(length: int) -> None:
         encode_68(manual_setpoint(), information=bytes(length))
 
 
-def test_what_does_not_fit_is_refused_not_wrapped() -> None:
+def test_a_value_that_does_not_fit_is_refused_not_wrapped() -> None:
     for setpoint in (
         Setpoint(currents=(6553.6, 0, 0), fail_safe=(0, 0, 0), fail_safe_timeout=1),
         Setpoint(currents=(-0.1, 0, 0), fail_safe=(0, 0, 0), fail_safe_timeout=1),
@@ -112,16 +112,16 @@ amperes = st.floats(0, 700, allow_nan=False)
 
 
 @given(
-    wishes=st.tuples(amperes, amperes, amperes),
+    ordered=st.tuples(amperes, amperes, amperes),
     fail_safe=st.tuples(amperes, amperes, amperes),
     ceiling=st.floats(6, 700),
     timeout=st.integers(1, 0xFFFF),
     serial=st.integers(0, 99_999_999),
     information=st.binary(min_size=16, max_size=16),
 )
-def test_what_is_encoded_is_what_the_other_side_reads(
+def test_a_chargepoint_decodes_the_encoded_values(
     *,
-    wishes: tuple[float, float, float],
+    ordered: tuple[float, float, float],
     fail_safe: tuple[float, float, float],
     ceiling: float,
     timeout: int,
@@ -129,7 +129,7 @@ def test_what_is_encoded_is_what_the_other_side_reads(
     information: bytes,
 ) -> None:
     orders = Orders(
-        limit=CurrentLimit(current=1000.0, phases=wishes),
+        limit=CurrentLimit(current=1000.0, phases=ordered),
         fail_safe=CurrentLimit(current=1000.0, phases=fail_safe),
         fail_safe_timeout=timeout,
     )
@@ -138,18 +138,18 @@ def test_what_is_encoded_is_what_the_other_side_reads(
         encode_69(setpoint),
         encode_68(setpoint, serial=serial, information=information),
     ):
-        body = witness.checked(request[1:-1].decode())
+        body = oracle.checked(request[1:-1].decode())
         assert body is not None
-        order = witness.order(body, 0.0)
+        order = oracle.order(body, 0.0)
         assert order is not None
         assert order.limits == pytest.approx(setpoint.currents)
         assert order.fallback == pytest.approx(setpoint.fail_safe)
         assert order.timeout == timeout
-        # What matters to a fuse: not a tenth more than was wished or allowed.
-        for sent, wish in zip(order.limits, wishes, strict=True):
-            assert sent <= min(wish, ceiling)
-        for sent, wish in zip(order.fallback, fail_safe, strict=True):
-            assert sent <= min(wish, ceiling)
+        # For the fuse: not a tenth more than ordered or allowed.
+        for sent, most in zip(order.limits, ordered, strict=True):
+            assert sent <= min(most, ceiling)
+        for sent, most in zip(order.fallback, fail_safe, strict=True):
+            assert sent <= min(most, ceiling)
         if order.command == 68:
             assert order.serial == f"{serial:08d}"
             assert order.information == information
@@ -223,11 +223,11 @@ def test_the_reply_68_of_the_manual_with_right_checksums() -> None:
         REPLY_68 + "0C70",
         REPLY_69.replace("FF32", "FF52") + "FB05",
         REPLY_69 + "FB05",
-        # As it stands in the text: digits are missing in the second module.
+        # As in the text: digits are missing in the second module.
         REPLY_69.replace("0000000000A00085FFBFFF32", "000000000A00085FFBFF52") + "FB05",
     ],
 )
-def test_what_the_manual_prints_damaged_is_refused(printed: str) -> None:
+def test_damaged_examples_of_the_manual_are_refused(printed: str) -> None:
     frames, framer = feed(b"\x02" + printed.encode() + b"\x03")
     assert frames == []
     assert framer.bad == 1
@@ -254,7 +254,7 @@ def test_no_modules_and_twenty_modules() -> None:
         "A080690001015e00",
     ],
 )
-def test_a_reply_that_does_not_fit_is_bad_in_spite_of_its_checksums(text: str) -> None:
+def test_a_reply_of_another_length_is_bad_despite_good_checksums(text: str) -> None:
     frames, framer = feed(frame(text))
     assert frames == []
     assert framer.bad == 1
@@ -263,7 +263,7 @@ def test_a_reply_that_does_not_fit_is_bad_in_spite_of_its_checksums(text: str) -
 
 
 @pytest.mark.parametrize("text", ["80A069" + ORDER, "BCA001", "A0806A", "80B1420K1"])
-def test_frames_of_others_are_good_and_not_ours(text: str) -> None:
+def test_other_frames_are_good_but_no_replies(text: str) -> None:
     frames, framer = feed(frame(text))
     assert [one.text for one in frames] == [text]
     assert framer.bad == framer.noise == 0
@@ -284,7 +284,7 @@ def signed(word: int) -> float:
 
 
 @given(interval=words, maximum=words, content=modules, volts=words, long=st.booleans())
-def test_a_reply_says_what_the_other_side_wrote(
+def test_a_reply_decodes_to_the_values_of_the_chargepoint(
     *,
     interval: int,
     maximum: int,
@@ -297,7 +297,7 @@ def test_a_reply_says_what_the_other_side_wrote(
     for values in content:
         parts += [*(f"{word:04X}" for word in values[:7]), f"{values[7]:08X}"]
         parts += 3 * [f"{volts:04X}"] if long else []
-    reply = decode(witness.frame("".join(parts)))
+    reply = decode(oracle.frame("".join(parts)))
     assert reply.serial == ("00001234" if long else None)
     assert reply.minimum_interval == interval
     assert reply.maximum_current == maximum / 10

@@ -1,4 +1,4 @@
-"""What cannot be is held back; what insists is the truth."""
+"""Implausible replies are quarantined; consistent ones in a row are accepted."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,9 +10,9 @@ from custom_components.evse_bus.evse.errors import ImplausibleReplyError
 from custom_components.evse_bus.evse.evbox.frames import ModuleReply, Reply
 from custom_components.evse_bus.evse.evbox.plausibility import (
     LARGEST_CONNECTION,
-    Confirmed,
+    AcceptedReply,
+    ConfirmedValue,
     Plausibility,
-    Taken,
     used_currents,
 )
 
@@ -21,30 +21,30 @@ from .replies import module, reply
 GOOD = reply(module(amperes=16.0), module(energy=7000))
 
 
-class Judge(Plausibility):
-    """Plausibility, with a reply every 5 s."""
+class Receiver(Plausibility):
+    """Plausibility with a reply every 5 s."""
 
     def __init__(self, *replies: Reply) -> None:
         super().__init__()
         self.now = 0.0
         for one in replies:
-            self.hear(one)
+            self.receive(one)
 
-    def hear(self, one: Reply) -> Taken:
+    def receive(self, one: Reply) -> AcceptedReply:
         self.now += 5.0
-        return self.take(one, self.now)
+        return self.accept(one, self.now)
 
-    def refuses(self, one: Reply) -> None:
-        before = self.__dict__ | {"_held": None, "now": None}
+    def assert_quarantined(self, one: Reply) -> None:
+        before = self.__dict__ | {"_quarantine": None, "now": None}
         values = (self.maximum.value, self.interval.value, self.minimum.value)
         with pytest.raises(ImplausibleReplyError):
-            self.hear(one)
-        assert self.__dict__ | {"_held": None, "now": None} == before
+            self.receive(one)
+        assert self.__dict__ | {"_quarantine": None, "now": None} == before
         assert values == (self.maximum.value, self.interval.value, self.minimum.value)
 
 
-def steady() -> Judge:
-    return Judge(GOOD, GOOD)
+def steady() -> Receiver:
+    return Receiver(GOOD, GOOD)
 
 
 def with_module(**values: object) -> Reply:
@@ -53,46 +53,46 @@ def with_module(**values: object) -> Reply:
 
 
 IMPLAUSIBLE = {
-    "maximum of nothing": reply(module(), module(energy=7000), maximum=0.0),
-    "maximum of a town": replace(GOOD, maximum_current=LARGEST_CONNECTION + 0.1),
-    "interval of hours": replace(GOOD, minimum_interval=0x1234),
-    "minimum above any pilot": with_module(minimum_current=80.1),
-    "more than the connection": with_module(currents=(16.0, 39.6, 16.0)),
+    "maximum 0": reply(module(), module(energy=7000), maximum=0.0),
+    "maximum too large": replace(GOOD, maximum_current=LARGEST_CONNECTION + 0.1),
+    "interval too long": replace(GOOD, minimum_interval=0x1234),
+    "minimum too high": with_module(minimum_current=80.1),
+    "current above the connection": with_module(currents=(16.0, 39.6, 16.0)),
     "cos phi above 1": with_module(cos_phi=(1.0, 1.001, 1.0)),
     "cos phi below -1": with_module(cos_phi=(1.0, 1.0, -1.001)),
-    "voltage between phases": with_module(voltages=(230, 400, 230)),
+    "voltage too high": with_module(voltages=(230, 400, 230)),
     "meter backwards": with_module(energy=999),
-    "meter ahead of itself": with_module(energy=5096),
+    "meter too fast": with_module(energy=5096),
 }
 
 
-@pytest.mark.parametrize("odd", IMPLAUSIBLE.values(), ids=IMPLAUSIBLE)
-def test_one_or_two_are_held_back_and_the_third_is_the_truth(odd: Reply) -> None:
-    judge = steady()
-    judge.refuses(odd)
-    assert judge.held == 1
-    assert judge.unsettled
-    judge.refuses(odd)
-    assert judge.hear(odd).reply is odd
-    assert judge.held == 0
-    # From now on it needs no more insistence.
-    assert judge.hear(odd).reply is odd
+@pytest.mark.parametrize("implausible", IMPLAUSIBLE.values(), ids=IMPLAUSIBLE)
+def test_two_are_quarantined_and_the_third_is_accepted(implausible: Reply) -> None:
+    receiver = steady()
+    receiver.assert_quarantined(implausible)
+    assert receiver.quarantined == 1
+    assert receiver.unconfirmed
+    receiver.assert_quarantined(implausible)
+    assert receiver.receive(implausible).reply is implausible
+    assert receiver.quarantined == 0
+    # From now on one reply is enough.
+    assert receiver.receive(implausible).reply is implausible
 
 
-@pytest.mark.parametrize("odd", IMPLAUSIBLE.values(), ids=IMPLAUSIBLE)
-def test_a_good_reply_between_begins_the_count_anew(odd: Reply) -> None:
-    judge = steady()
+@pytest.mark.parametrize("implausible", IMPLAUSIBLE.values(), ids=IMPLAUSIBLE)
+def test_a_plausible_reply_between_restarts_the_count(implausible: Reply) -> None:
+    receiver = steady()
     for _ in range(5):
-        judge.refuses(odd)
-        judge.refuses(odd)
-        judge.hear(GOOD)
+        receiver.assert_quarantined(implausible)
+        receiver.assert_quarantined(implausible)
+        receiver.receive(GOOD)
 
 
-def test_replies_that_contradict_each_other_are_never_the_truth() -> None:
-    judge = steady()
+def test_inconsistent_replies_are_never_accepted() -> None:
+    receiver = steady()
     for _ in range(3):
-        for odd in IMPLAUSIBLE.values():
-            judge.refuses(odd)
+        for implausible in IMPLAUSIBLE.values():
+            receiver.assert_quarantined(implausible)
 
 
 @pytest.mark.parametrize(
@@ -109,124 +109,124 @@ def test_replies_that_contradict_each_other_are_never_the_truth() -> None:
         lambda n: replace(with_module(energy=1), serial=f"{n:08d}"),
     ],
 )
-def test_strange_in_the_same_place_and_not_agreeing(
+def test_different_values_in_the_same_place_are_never_accepted(
     vary: Callable[[int], Reply],
 ) -> None:
-    judge = steady()
+    receiver = steady()
     for number in range(6):
-        judge.refuses(vary(number))
+        receiver.assert_quarantined(vary(number))
 
 
-def test_an_over_current_is_told_apart_from_other_strange_values() -> None:
-    judge = steady()
+def test_an_over_current_is_no_value_out_of_range() -> None:
+    receiver = steady()
     over = with_module(currents=(50.0, 0.0, 0.0))
-    judge.refuses(over)
-    # A current moves while it is measured; a second phase may come and go.
-    judge.refuses(with_module(currents=(55.0, 45.0, 0.0)))
-    taken = judge.hear(over)
+    receiver.assert_quarantined(over)
+    # A measured current varies; one common phase is enough.
+    receiver.assert_quarantined(with_module(currents=(55.0, 45.0, 0.0)))
+    taken = receiver.receive(over)
     assert taken.over_current
-    assert not taken.strange
-    assert not judge.hear(GOOD).over_current
-    strange = with_module(cos_phi=(1.2, 1.0, 1.0))
-    judge.refuses(strange)
-    judge.refuses(strange)
-    taken = judge.hear(strange)
-    assert taken.strange
+    assert not taken.out_of_range
+    assert not receiver.receive(GOOD).over_current
+    impossible = with_module(cos_phi=(1.2, 1.0, 1.0))
+    receiver.assert_quarantined(impossible)
+    receiver.assert_quarantined(impossible)
+    taken = receiver.receive(impossible)
+    assert taken.out_of_range
     assert not taken.over_current
 
 
-def test_all_modules_together_are_held_against_the_connection() -> None:
-    judge = steady()
+def test_the_sum_of_all_modules_is_compared_with_the_connection() -> None:
+    receiver = steady()
     both = reply(module(amperes=20.0), module(amperes=20.0, energy=7000))
     assert used_currents(both) == (40.0, 40.0, 40.0)
-    judge.refuses(both)
+    receiver.assert_quarantined(both)
 
 
-def test_a_meter_that_insists_is_another_meter() -> None:
-    judge = steady()
+def test_a_confirmed_jump_is_another_meter() -> None:
+    receiver = steady()
     swapped = with_module(energy=90_000)
-    judge.refuses(swapped)
-    judge.refuses(swapped)
-    taken = judge.hear(swapped)
+    receiver.assert_quarantined(swapped)
+    receiver.assert_quarantined(swapped)
+    taken = receiver.receive(swapped)
     assert taken.totals == (90_000, 7000)
     assert taken.generations == (1, 0)
-    assert not taken.strange
+    assert not taken.out_of_range
 
 
 # -- The maximum of the connection ---------------------------------------------------
 
 
 def test_the_maximum_counts_when_two_replies_agree() -> None:
-    judge = Judge()
-    assert judge.maximum.value == 6.0
-    judge.hear(GOOD)
-    assert judge.maximum.value == 6.0
-    assert judge.unsettled
-    judge.hear(GOOD)
-    assert judge.maximum.value == 35.0
+    receiver = Receiver()
+    assert receiver.maximum.value == 6.0
+    receiver.receive(GOOD)
+    assert receiver.maximum.value == 6.0
+    assert receiver.unconfirmed
+    receiver.receive(GOOD)
+    assert receiver.maximum.value == 35.0
 
 
 def test_a_raised_maximum_counts_as_far_as_two_replies_agree() -> None:
-    judge = steady()
-    judge.hear(replace(GOOD, maximum_current=350.0))
-    assert judge.maximum.value == 35.0
-    judge.hear(GOOD)
-    assert judge.maximum.value == 35.0
-    judge.hear(replace(GOOD, maximum_current=63.0))
-    judge.hear(replace(GOOD, maximum_current=60.0))
-    assert judge.maximum.value == 60.0
+    receiver = steady()
+    receiver.receive(replace(GOOD, maximum_current=350.0))
+    assert receiver.maximum.value == 35.0
+    receiver.receive(GOOD)
+    assert receiver.maximum.value == 35.0
+    receiver.receive(replace(GOOD, maximum_current=63.0))
+    receiver.receive(replace(GOOD, maximum_current=60.0))
+    assert receiver.maximum.value == 60.0
 
 
 def test_a_lowered_maximum_counts_at_once() -> None:
-    judge = steady()
-    judge.hear(replace(GOOD, maximum_current=16.0))
-    assert judge.maximum.value == 16.0
-    first = Judge()
-    first.hear(replace(GOOD, maximum_current=5.0, modules=()))
+    receiver = steady()
+    receiver.receive(replace(GOOD, maximum_current=16.0))
+    assert receiver.maximum.value == 16.0
+    first = Receiver()
+    first.receive(replace(GOOD, maximum_current=5.0, modules=()))
     assert first.maximum.value == 5.0
 
 
-def test_the_same_for_the_interval_and_the_minimum() -> None:
-    judge = Judge()
-    assert (judge.interval.value, judge.minimum.value) == (20, 6.0)
-    needs = reply(module(minimum=12.0), module(minimum=8.0))
-    judge.hear(needs)
-    assert (judge.interval.value, judge.minimum.value) == (1, 6.0)
-    judge.hear(needs)
-    assert judge.minimum.value == 8.0
-    judge.hear(reply(module(minimum=4.0)))
-    assert judge.minimum.value == 6.0
+def test_the_interval_and_the_minimum_are_confirmed_too() -> None:
+    receiver = Receiver()
+    assert (receiver.interval.value, receiver.minimum.value) == (20, 6.0)
+    twelve_and_eight = reply(module(minimum=12.0), module(minimum=8.0))
+    receiver.receive(twelve_and_eight)
+    assert (receiver.interval.value, receiver.minimum.value) == (1, 6.0)
+    receiver.receive(twelve_and_eight)
+    assert receiver.minimum.value == 8.0
+    receiver.receive(reply(module(minimum=4.0)))
+    assert receiver.minimum.value == 6.0
 
 
 def test_after_an_absence_the_maximum_is_unknown_again() -> None:
-    judge = steady()
-    judge.forget()
-    assert judge.maximum.value == 6.0
-    assert judge.maximum.told is None
-    judge.hear(replace(GOOD, maximum_current=63.0))
-    assert judge.maximum.value == 6.0
+    receiver = steady()
+    receiver.reset()
+    assert receiver.maximum.value == 6.0
+    assert receiver.maximum.reported is None
+    receiver.receive(replace(GOOD, maximum_current=63.0))
+    assert receiver.maximum.value == 6.0
 
 
 @given(st.lists(st.floats(0.1, 1000.0)), st.floats(0.1, 1000.0))
-def test_one_reply_alone_never_raises(told: list[float], lie: float) -> None:
-    one, two = Confirmed(6.0), Confirmed(6.0)
-    for value in told:
-        one.tell(value)
-        two.tell(value)
+def test_one_reply_alone_never_raises(reported: list[float], wrong: float) -> None:
+    one, two = ConfirmedValue(6.0), ConfirmedValue(6.0)
+    for value in reported:
+        one.update(value)
+        two.update(value)
     before = one.value
-    one.tell(lie)
-    assert one.value <= before or one.value <= max([*told[-1:], 6.0])
-    assert one.value <= lie
-    # And what is told next is not raised by the lie before it.
-    for value in told[:1]:
-        one.tell(value)
+    one.update(wrong)
+    assert one.value <= before or one.value <= max([*reported[-1:], 6.0])
+    assert one.value <= wrong
+    # And the next value is not raised by the wrong one before it.
+    for value in reported[:1]:
+        one.update(value)
         assert one.value <= value
 
 
-# -- Whatever comes ------------------------------------------------------------------
+# -- Arbitrary replies ---------------------------------------------------------------
 
 currents = st.floats(0, 6553.5).map(lambda value: round(value, 1))
-odd_modules = st.builds(
+any_modules = st.builds(
     module,
     amperes=currents,
     cos_phi=st.floats(-32, 32),
@@ -234,55 +234,55 @@ odd_modules = st.builds(
     minimum=currents,
     voltages=st.tuples(*3 * [st.integers(0, 0xFFFF).map(float)]),
 )
-odd_replies = st.builds(
+any_replies = st.builds(
     lambda modules, maximum, interval: reply(
         *modules, maximum=maximum, interval=interval
     ),
-    st.lists(odd_modules, max_size=4),
+    st.lists(any_modules, max_size=4),
     currents,
     st.integers(0, 0xFFFF),
 )
 
 
-@given(st.lists(odd_replies, max_size=12))
-def test_what_is_taken_can_be_or_has_insisted(replies: list[Reply]) -> None:
-    judge = Judge()
-    held = 0
+@given(st.lists(any_replies, max_size=12))
+def test_an_accepted_reply_is_plausible_or_confirmed(replies: list[Reply]) -> None:
+    receiver = Receiver()
+    quarantined = 0
     for one in replies:
-        highest = judge.maximum.value
+        highest = receiver.maximum.value
         try:
-            taken = judge.hear(one)
+            taken = receiver.receive(one)
         except ImplausibleReplyError:
-            held += 1
-            assert judge.maximum.value == highest
+            quarantined += 1
+            assert receiver.maximum.value == highest
             continue
-        if taken.oddities:
-            assert held >= 2
+        if taken.implausible:
+            assert quarantined >= 2
         else:
             assert 0 < one.maximum_current <= LARGEST_CONNECTION
-            carried = max(highest, one.maximum_current) * 1.1 + 1
-            assert max(used_currents(one)) <= carried
+            highest_current = max(highest, one.maximum_current) * 1.1 + 1
+            assert max(used_currents(one)) <= highest_current
             for part in one.modules:
                 assert all(abs(value) <= 1 for value in part.cos_phi)
                 assert all(value <= 300 for value in part.voltages or ())
-        held = 0
+        quarantined = 0
 
 
-@given(st.lists(odd_replies, max_size=8))
-def test_a_good_box_is_believed_again_whatever_came_before(
+@given(st.lists(any_replies, max_size=8))
+def test_plausible_replies_are_accepted_after_any_others(
     replies: list[Reply],
 ) -> None:
-    judge = Judge()
+    receiver = Receiver()
     for one in replies:
         try:
-            judge.hear(one)
+            receiver.receive(one)
         except ImplausibleReplyError:
             continue
     for _ in range(5):
         try:
-            taken = judge.hear(GOOD)
+            taken = receiver.receive(GOOD)
         except ImplausibleReplyError:
             continue
     assert taken.reply is GOOD
-    assert judge.maximum.value == 35.0
+    assert receiver.maximum.value == 35.0
     assert None not in taken.totals

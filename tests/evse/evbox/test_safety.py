@@ -1,7 +1,7 @@
-"""The safety rules, with the wire as the witness.
+"""The safety rules, checked on the wire.
 
-Whatever is asked, told, lost, damaged or unplugged, in any order: each request is
-judged in the moment it is sent, as the ChargePoint's side reads it.
+Requests of the user, replies, losses, damage and unplugging in any order: each frame
+is checked at the moment it is sent, as a ChargePoint decodes it.
 """
 
 import asyncio
@@ -26,13 +26,13 @@ from .ether import Scene
 INSTALLATION = 25.0
 type Act = tuple[str, float]
 
-wishes = st.one_of(
+amperes = st.one_of(
     st.floats(6, INSTALLATION),
     st.sampled_from([0.0, 6.0, INSTALLATION, 5.9, -1.0, nan, inf, 10_000.0, 25.1]),
 )
 acts = st.one_of(
     st.tuples(
-        st.sampled_from(["current", "phase", "fail-safe", "fail-safe phase"]), wishes
+        st.sampled_from(["current", "phase", "fail-safe", "fail-safe phase"]), amperes
     ),
     st.tuples(st.sampled_from(["pause", "allow"]), st.just(0.0)),
     st.tuples(st.just("time-out"), st.sampled_from([-1, 0, 1, 9, 60, 600, 10**9])),
@@ -47,7 +47,7 @@ acts = st.one_of(
 
 @dataclass
 class Trial:
-    """One charger, somebody who asks for things, and what was asked last."""
+    """One charger, and the orders that a user requested last."""
 
     maximum: float
     interval: int = 1
@@ -71,7 +71,7 @@ class Trial:
             min_interval=self.interval,
         )
         self.scene = Scene.of(self.point)
-        self.scene.ether.watch = self.judge
+        self.scene.ether.watch = self.check
         orders = Orders(
             limit=CurrentLimit(current=self.current),
             fail_safe=CurrentLimit(current=self.fail_safe),
@@ -80,7 +80,7 @@ class Trial:
             orders=orders, installation_limit=INSTALLATION, poll_interval=2.0
         )
 
-    def judge(self, order: Order) -> None:
+    def check(self, order: Order) -> None:
         ceiling = min(INSTALLATION, self.maximum)
         if self.answered < 2:
             ceiling = min(ceiling, 6.0)
@@ -96,57 +96,57 @@ class Trial:
             assert sent <= self.fail_safe_phase or index != 1
         assert order.timeout >= 3
 
-    async def ask(self, change: OrderChange, **wished: float | bool) -> None:
-        """Ask for a change; nobody waits for what becomes of it."""
+    async def request(self, change: OrderChange, **orders: float | bool) -> None:
+        """Request a change without waiting for its result."""
 
-        async def asking() -> None:
-            # From this moment on the wire is judged by it.
-            for name, value in wished.items():
+        async def requesting() -> None:
+            # From this moment on the frames are checked against it.
+            for name, value in orders.items():
                 setattr(self, name, value)
             with suppress(EvseError):
                 await self.charger.change_orders(change)
 
-        self.tasks.append(asyncio.create_task(asking()))
+        self.tasks.append(asyncio.create_task(requesting()))
         await asyncio.sleep(0)
 
     def usable(self, value: float, *, from_minimum: bool) -> bool:
-        """Return whether a wish may be refused or must be taken."""
+        """Return whether a value must be accepted; another one may be refused."""
         if not 0 <= value <= INSTALLATION:
             return False
         return not from_minimum or value == 0 or value >= 6.0
 
-    async def act(self, what: str, value: float) -> None:
-        await getattr(self, "do_" + what.replace(" ", "_").replace("-", "_"))(value)
+    async def act(self, name: str, value: float) -> None:
+        await getattr(self, "do_" + name.replace(" ", "_").replace("-", "_"))(value)
 
     async def do_current(self, value: float) -> None:
-        taken = self.usable(value, from_minimum=True)
-        await self.ask(
-            OrderChange(current=value), **({"current": value} if taken else {})
+        usable = self.usable(value, from_minimum=True)
+        await self.request(
+            OrderChange(current=value), **({"current": value} if usable else {})
         )
 
     async def do_phase(self, value: float) -> None:
-        taken = self.usable(value, from_minimum=True)
+        usable = self.usable(value, from_minimum=True)
         change = OrderChange(phases=(None, value, None))
-        await self.ask(change, **({"phase": value} if taken else {}))
+        await self.request(change, **({"phase": value} if usable else {}))
 
     async def do_fail_safe(self, value: float) -> None:
-        taken = self.usable(value, from_minimum=False)
+        usable = self.usable(value, from_minimum=False)
         change = OrderChange(fail_safe_current=value)
-        await self.ask(change, **({"fail_safe": value} if taken else {}))
+        await self.request(change, **({"fail_safe": value} if usable else {}))
 
     async def do_fail_safe_phase(self, value: float) -> None:
-        taken = self.usable(value, from_minimum=False)
+        usable = self.usable(value, from_minimum=False)
         change = OrderChange(fail_safe_phases=(None, value, None))
-        await self.ask(change, **({"fail_safe_phase": value} if taken else {}))
+        await self.request(change, **({"fail_safe_phase": value} if usable else {}))
 
     async def do_time_out(self, value: float) -> None:
-        await self.ask(OrderChange(fail_safe_timeout=int(value)))
+        await self.request(OrderChange(fail_safe_timeout=int(value)))
 
     async def do_pause(self, _value: float) -> None:
-        await self.ask(OrderChange(allowed=False), allowed=False)
+        await self.request(OrderChange(allowed=False), allowed=False)
 
     async def do_allow(self, _value: float) -> None:
-        await self.ask(OrderChange(allowed=True), allowed=True)
+        await self.request(OrderChange(allowed=True), allowed=True)
 
     async def do_wait(self, value: float) -> None:
         await asyncio.sleep(value)
@@ -181,10 +181,10 @@ class Trial:
 
     async def run(self, acts: list[Act]) -> None:
         async with self.scene:
-            # At most this often was it answered; only what was not counts here.
+            # An upper bound: a reply that is lost on the way is counted too.
             self.scene.ether.damage = self.count_answers
-            for what, value in acts:
-                await self.act(what, value)
+            for name, value in acts:
+                await self.act(name, value)
             self.point.faults.dead = False
             # Commands that cannot be merged wait for one minimum interval each.
             for _ in range(60):
@@ -203,28 +203,28 @@ class Trial:
     seed=st.integers(0, 100),
     steps=st.lists(acts, max_size=25),
 )
-def test_no_order_of_events_puts_too_much_on_the_wire(
+def test_no_sequence_of_events_puts_too_much_current_on_the_wire(
     maximum: float, interval: int, seed: int, steps: list[Act]
 ) -> None:
     trial = Trial(maximum, interval, seed)
     wrong: list[AssertionError] = []
 
-    def judge(order: Order) -> None:
+    def check(order: Order) -> None:
         try:
-            trial.judge(order)
+            trial.check(order)
         except AssertionError as error:
             wrong.append(error)
 
-    trial.scene.ether.watch = judge
+    trial.scene.ether.watch = check
     simulate(trial.run(steps))
     assert not wrong, wrong[0]
-    # A box that lost its power does not remember when it was last spoken to, and one
-    # whose answer was lost has heard us all the same: never too soon.
+    # Also after a power failure, and after a reply that was lost, although the library
+    # cannot know whether the box received its request.
     assert trial.point.counters.too_soon == 0
-    # In the end what was wished for stands, as far as it may be.
+    # In the end the orders stand, within the limits.
     ceiling = min(INSTALLATION, maximum)
-    wish = min(trial.current, ceiling)
-    expected = wish if trial.allowed and wish >= 6.0 else 0.0
+    ordered = min(trial.current, ceiling)
+    expected = ordered if trial.allowed and ordered >= 6.0 else 0.0
     last = trial.scene.ether.orders[-1]
     assert last.limits[0] <= expected
 
@@ -237,27 +237,27 @@ def test_no_order_of_events_puts_too_much_on_the_wire(
         max_size=12,
     )
 )
-def test_no_request_is_above_what_the_last_two_answers_agree_on(
+def test_no_request_is_above_the_maximum_of_the_last_two_replies(
     steps: list[tuple[float, float]],
 ) -> None:
     async def scene() -> None:
         point = EvboxChargePoint(1923054)
-        told: list[float] = []
+        reported: list[float] = []
         wrong: list[tuple[float, list[float]]] = []
 
-        def tell(data: bytes) -> bytes:
+        def record(data: bytes) -> bytes:
             # The word after serial number and interval (manual, "Response").
-            told.append(int(data[19:23], 16) / 10)
+            reported.append(int(data[19:23], 16) / 10)
             return data
 
-        def judge(order: Order) -> None:
+        def check(order: Order) -> None:
             highest = max(order.limits + order.fallback)
-            allowed = min(told[-2:]) if len(told) > 1 else 6.0
+            allowed = min(reported[-2:]) if len(reported) > 1 else 6.0
             if highest > allowed:
-                wrong.append((highest, told[-2:]))
+                wrong.append((highest, reported[-2:]))
 
         stage = Scene.of(point)
-        stage.ether.damage, stage.ether.watch = tell, judge
+        stage.ether.damage, stage.ether.watch = record, check
         async with stage:
             stage.add(
                 orders=Orders(
@@ -275,8 +275,10 @@ def test_no_request_is_above_what_the_last_two_answers_agree_on(
     simulate(scene())
 
 
-async def damaged(seed: int, hurt: Callable[[bytearray, Random], None]) -> EvboxCharger:
-    """Have all answers but a few damaged, and look at each reading."""
+async def run_with_damage(
+    seed: int, damage_frame: Callable[[bytearray, Random], None]
+) -> EvboxCharger:
+    """Damage 40 % of the replies, and check each reading."""
     module = Module(
         energy_wh=5000, currents=(11.0, 12.0, 13.0), cos_phis=(0.9, 0.8, 0.7)
     )
@@ -286,7 +288,7 @@ async def damaged(seed: int, hurt: Callable[[bytearray, Random], None]) -> Evbox
     def damage(data: bytes) -> bytes:
         out = bytearray(data)
         if rng.random() < 0.4:
-            hurt(out, rng)
+            damage_frame(out, rng)
         return bytes(out)
 
     stage.ether.damage = damage
@@ -327,23 +329,23 @@ def burst(out: bytearray, rng: Random) -> None:
     out[start : start + 8] = rng.randbytes(8)
 
 
-@pytest.mark.parametrize("hurt", [flip, swallow, truncate, burst])
+@pytest.mark.parametrize("damage_frame", [flip, swallow, truncate, burst])
 @pytest.mark.parametrize("seed", range(3))
 def test_no_damaged_frame_makes_a_wrong_value(
-    hurt: Callable[[bytearray, Random], None], seed: int
+    damage_frame: Callable[[bytearray, Random], None], seed: int
 ) -> None:
-    simulate(damaged(seed, hurt))
+    simulate(run_with_damage(seed, damage_frame))
 
 
 def fake(out: bytearray, rng: Random) -> None:
-    """Change digits and make the checksums right again: nothing else can tell."""
+    """Change a digit and correct the checksums: only the value can be checked."""
     at = rng.randrange(25, len(out) - 5)
     out[at : at + 1] = b"F"
     out[:] = frame(out[1:-5].decode())
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_right_checksums_do_not_make_an_impossible_value(seed: int) -> None:
+def test_an_impossible_value_with_good_checksums_is_not_shown(seed: int) -> None:
     async def scene() -> None:
         rng = Random(seed)  # noqa: S311 - repeatable on purpose
         module = Module(energy_wh=5000, currents=(11.0, 12.0, 13.0))
@@ -376,12 +378,12 @@ def test_right_checksums_do_not_make_an_impossible_value(seed: int) -> None:
     st.sampled_from([nan, inf, -inf, -0.1, -6.0, 10_000.0, 32.1, True, "16", None]),
     st.sampled_from(["current", "fail_safe_current", "phases", "fail_safe_timeout"]),
 )
-def test_absurd_wishes_are_refused_before_anything_is_sent(
-    value: object, what: str
+def test_unusable_values_are_refused_before_anything_is_sent(
+    value: object, field: str
 ) -> None:
-    if value is None or (what == "fail_safe_timeout" and value in (10_000.0, 32.1)):
+    if value is None or (field == "fail_safe_timeout" and value in (10_000.0, 32.1)):
         return
-    wish = (None, value, None) if what == "phases" else value
+    change = {field: (None, value, None) if field == "phases" else value}
 
     async def scene() -> None:
         async with Scene.of(EvboxChargePoint(1923054)) as stage:
@@ -389,11 +391,11 @@ def test_absurd_wishes_are_refused_before_anything_is_sent(
             await asyncio.sleep(3.0)
             before = (charger.orders, len(stage.ether.sent))
             try:
-                await charger.change_orders(OrderChange(**{what: wish}))  # type: ignore[arg-type]
+                await charger.change_orders(OrderChange(**change))  # type: ignore[arg-type]
             except RefusedOrderError:
                 pass
             else:
-                raise AssertionError("it was taken")
+                raise AssertionError("it was accepted")
             assert (charger.orders, len(stage.ether.sent)) == before
 
     simulate(scene())

@@ -1,4 +1,4 @@
-"""Finding ChargePoints: a probe imposes exactly what was confirmed, up to 6 A."""
+"""Search for ChargePoints: a probe sends the confirmed orders, up to 6 A."""
 
 import asyncio
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from tests.virtual.evbox_frames import frame
 
 from .ether import ORDERS, Scene
 
-ANYBODY = EvboxConfig(key="scan", name="scan", address=0, installation_limit=32.0)
+ANY = EvboxConfig(key="scan", name="scan", address=0, installation_limit=32.0)
 CONFIRMED = Orders(
     limit=CurrentLimit(current=32.0, phases=(None, 0.0, None)),
     fail_safe=CurrentLimit(current=4.0, phases=(None, None, 3.5)),
@@ -25,7 +25,7 @@ CONFIRMED = Orders(
 
 
 async def find(
-    stage: Scene, config: EvboxConfig = ANYBODY, orders: Orders = CONFIRMED
+    stage: Scene, config: EvboxConfig = ANY, orders: Orders = CONFIRMED
 ) -> tuple[ScanResult, list[float]]:
     progress: list[float] = []
     report = await PROTOCOL.scan(stage.bus, config, orders, progress.append)
@@ -35,7 +35,7 @@ async def find(
     return report, progress
 
 
-def test_the_one_box_on_the_line() -> None:
+def test_the_only_box_on_the_line() -> None:
     async def scene() -> None:
         point = EvboxChargePoint(1923054, 3, max_current=25.0)
         async with Scene.of(point) as stage:
@@ -56,7 +56,7 @@ def test_the_one_box_on_the_line() -> None:
     simulate(scene())
 
 
-def test_a_pause_is_imposed_as_a_pause() -> None:
+def test_a_pause_is_sent_as_a_pause() -> None:
     async def scene() -> None:
         async with Scene.of(EvboxChargePoint(5)) as stage:
             await find(stage, orders=replace(CONFIRMED, allowed=False))
@@ -69,14 +69,14 @@ def test_a_typed_serial_number_reaches_that_box_only() -> None:
     async def scene() -> None:
         points = [EvboxChargePoint(11), EvboxChargePoint(12)]
         async with Scene.of(*points) as stage:
-            report, _ = await find(stage, replace(ANYBODY, address=12))
+            report, _ = await find(stage, replace(ANY, address=12))
             assert [one.address for one in report.found] == [12]
             assert [len(point.orders) for point in points] == [0, 1]
 
     simulate(scene())
 
 
-def test_several_boxes_that_answer_one_after_the_other_are_all_found() -> None:
+def test_several_boxes_that_reply_one_after_the_other_are_all_found() -> None:
     async def scene() -> None:
         points = [
             EvboxChargePoint(serial, turn_round=0.11 * number)
@@ -90,25 +90,25 @@ def test_several_boxes_that_answer_one_after_the_other_are_all_found() -> None:
     simulate(scene())
 
 
-def test_two_boxes_that_answer_69_are_duplicates() -> None:
+def test_two_replies_69_are_duplicates() -> None:
     async def scene() -> None:
         points = [
             EvboxChargePoint(serial, serial, turn_round=0.11 * serial)
             for serial in (1, 2)
         ]
         async with Scene.of(*points) as stage:
-            report, _ = await find(stage, replace(ANYBODY, command=69))
+            report, _ = await find(stage, replace(ANY, command=69))
             assert (report.found, report.duplicates) == ((), (0,))
 
     simulate(scene())
 
 
-def test_one_box_that_knows_69_only() -> None:
+def test_a_box_without_command_68() -> None:
     async def scene() -> None:
         async with Scene.of(EvboxChargePoint(7, commands={69})) as stage:
             report, _ = await find(stage)
             assert report == ScanResult()
-            report, _ = await find(stage, replace(ANYBODY, command=69))
+            report, _ = await find(stage, replace(ANY, command=69))
             (one,) = report.found
             assert (one.address, one.serial) == (0, None)
 
@@ -119,7 +119,7 @@ def test_one_box_that_knows_69_only() -> None:
     ("damage", "duplicates"),
     [(lambda _data: b"\x02A0\x7f\x80\x03", (0,)), (lambda _data: b"\x80\xfe\x11", ())],
 )
-def test_answers_that_nobody_can_read(
+def test_unreadable_replies(
     damage: Callable[[bytes], bytes], duplicates: tuple[int, ...]
 ) -> None:
     async def scene() -> None:
@@ -128,18 +128,18 @@ def test_answers_that_nobody_can_read(
             report, _ = await find(stage)
             assert (report.found, report.duplicates) == ((), duplicates)
             assert report.unreadable
-            # The box has heard the first probe: the second is not too soon.
+            # The box has received the first probe: the second is not too soon.
             assert len(stage.ether.sent) == 2
             assert stage.ether.pauses()[0] >= 20.0
             assert stage.ether.points[0].counters.too_soon == 0
-            # A typed number is that of one box, so it is the line that is bad.
-            report, _ = await find(stage, replace(ANYBODY, address=11))
+            # A typed number addresses one box, so the line must be bad.
+            report, _ = await find(stage, replace(ANY, address=11))
             assert (report.duplicates, report.unreadable) == ((), True)
 
     simulate(scene())
 
 
-def test_a_lost_answer_is_asked_for_once_more() -> None:
+def test_a_probe_without_a_reply_is_repeated_once() -> None:
     async def scene() -> None:
         point = EvboxChargePoint(11, min_interval=20)
         async with Scene.of(point) as stage:
@@ -151,7 +151,7 @@ def test_a_lost_answer_is_asked_for_once_more() -> None:
     simulate(scene())
 
 
-def test_nobody_there() -> None:
+def test_no_box_on_the_line() -> None:
     async def scene() -> None:
         async with Scene.of() as stage:
             started = now()
@@ -162,7 +162,7 @@ def test_nobody_there() -> None:
     simulate(scene())
 
 
-def test_an_answer_that_cannot_be_is_not_a_box() -> None:
+def test_an_implausible_reply_is_not_a_box() -> None:
     async def scene() -> None:
         point = EvboxChargePoint(11, [Module(voltages=(4000.0, 0.0, 0.0))])
         async with Scene.of(point) as stage:
@@ -173,7 +173,7 @@ def test_an_answer_that_cannot_be_is_not_a_box() -> None:
     simulate(scene())
 
 
-def test_the_same_answer_twice_is_one_box() -> None:
+def test_the_same_reply_twice_is_one_box() -> None:
     async def scene() -> None:
         point = EvboxChargePoint(11)
         async with Scene.of(point) as stage:
@@ -185,12 +185,14 @@ def test_the_same_answer_twice_is_one_box() -> None:
     simulate(scene())
 
 
-def test_other_peoples_answers_are_not_found() -> None:
+def test_replies_of_other_boxes_are_ignored() -> None:
     async def scene() -> None:
         async with Scene.of(EvboxChargePoint(11)) as stage:
-            others = frame("A080690001015E00") + frame("A08068000000770001015E00")
-            stage.ether.damage = lambda data: others + data
-            report, _ = await find(stage, replace(ANYBODY, address=11))
+            other_replies = frame("A080690001015E00") + frame(
+                "A08068000000770001015E00"
+            )
+            stage.ether.damage = lambda data: other_replies + data
+            report, _ = await find(stage, replace(ANY, address=11))
             assert [one.address for one in report.found] == [11]
 
     simulate(scene())
@@ -204,8 +206,8 @@ def test_a_search_does_not_set_the_limits_of_boxes_in_use() -> None:
             with pytest.raises(RefusedOrderError, match="serial number"):
                 await find(stage)
             with pytest.raises(RefusedOrderError):
-                await find(stage, replace(ANYBODY, address=12, command=69))
-            report, _ = await find(stage, replace(ANYBODY, address=12))
+                await find(stage, replace(ANY, address=12, command=69))
+            report, _ = await find(stage, replace(ANY, address=12))
             assert [one.address for one in report.found] == [12]
         assert {order.serial for order in stage.ether.orders} == {
             "00000011",
@@ -226,20 +228,20 @@ def test_orders_that_cannot_be_sent_are_refused() -> None:
     simulate(scene())
 
 
-def test_others_who_never_stop_talking_are_told_as_such() -> None:
+def test_a_line_that_is_always_busy_raises() -> None:
     async def scene() -> None:
         async with Scene.of(EvboxChargePoint(11)) as stage:
 
-            async def talk() -> None:
+            async def send_forever() -> None:
                 while True:
                     stage.ether.foreign(b"\x55")
                     await asyncio.sleep(0.05)
 
-            talking = asyncio.create_task(talk())
+            sending = asyncio.create_task(send_forever())
             await asyncio.sleep(0.1)
             with pytest.raises(LineBusyError):
                 await find(stage)
-            talking.cancel()
+            sending.cancel()
             assert stage.ether.sent == []
 
     simulate(scene())

@@ -1,4 +1,4 @@
-"""The whole way: library, serialx, a pty paced at 38400 baud, a virtual ChargePoint."""
+"""End to end: library, serialx, a pty paced at 38400 baud, a virtual ChargePoint."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -61,8 +61,8 @@ def sent(virtual: VirtualBus) -> list[Order]:
     return orders_in(virtual.log.bursts())
 
 
-async def known(virtual: VirtualBus, charger: EvboxCharger) -> None:
-    """Wait until the maximum is known and what stands has been sent."""
+async def orders_sent(virtual: VirtualBus, charger: EvboxCharger) -> None:
+    """Wait until the maximum is known and the orders that stand have been sent."""
     await virtual.wait_for_async(
         lambda: (
             charger.limits.reported == 35.0
@@ -81,7 +81,7 @@ async def test_a_car_charges_and_is_paused(*, echo: bool) -> None:
         charger = make(1923054)
         bus.add(charger)
         car.plug_in()
-        await known(virtual, charger)
+        await orders_sent(virtual, charger)
         await virtual.wait_for_async(
             lambda: (
                 charger.reading is not None
@@ -101,11 +101,11 @@ async def test_other_masters_and_half_frames() -> None:
         chargers = [make(11), make(12)]
         for charger in chargers:
             bus.add(charger)
-        # Another SmartGrid module's box answers it, and somebody gives up half-way.
+        # A reply to another SmartGrid module, after a frame that ends half-way.
         others = frame("A08068000000770001015E00") + frame("BCA00142")
         virtual.foreign_traffic(others[:20] + others, 0.9, polite=0.02)
-        await known(virtual, chargers[0])
-        await known(virtual, chargers[1])
+        await orders_sent(virtual, chargers[0])
+        await orders_sent(virtual, chargers[1])
         virtual.quiet()
         for charger in chargers:
             assert charger.info is not None
@@ -124,7 +124,7 @@ async def test_an_adapter_unplugged_in_mid_frame_and_back() -> None:
     async with on_wire(point) as (virtual, bus):
         charger = make(1923054)
         bus.add(charger)
-        await known(virtual, charger)
+        await orders_sent(virtual, charger)
         await virtual.wait_for_async(lambda: virtual.wire.busy(virtual.time()))
         virtual.unplug()
         await virtual.wait_for_async(lambda: not charger.available)
@@ -132,18 +132,18 @@ async def test_an_adapter_unplugged_in_mid_frame_and_back() -> None:
         before = len(sent(virtual))
         virtual.replug()
         await virtual.wait_for_async(lambda: charger.available)
-        await known(virtual, charger)
+        await orders_sent(virtual, charger)
         assert max(sent(virtual)[before].limits) == 6.0
         assert len(charger.reading.connectors if charger.reading else ()) == 20
 
 
-async def test_an_answer_cut_short() -> None:
+async def test_a_truncated_reply() -> None:
     module = Module(energy_wh=5000, currents=(11.0, 12.0, 13.0))
     point = EvboxChargePoint(1923054, [module], min_interval=0)
     async with on_wire(point) as (virtual, bus):
         charger = make(1923054)
         bus.add(charger)
-        await known(virtual, charger)
+        await orders_sent(virtual, charger)
         point.faults.once("truncate", 40)
         await virtual.wait_for_async(lambda: charger.statistics.bad_frames == 1)
         replies = charger.statistics.replies
@@ -155,8 +155,8 @@ async def test_an_answer_cut_short() -> None:
         assert charger.available
 
 
-async def test_boxes_that_answer_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    # The package shows the function of that name, not the module.
+async def test_boxes_that_reply_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    # In the package this name is the function, not the module.
     module = import_module("custom_components.evse_bus.evse.evbox.scan")
     monkeypatch.setattr(module, "RETRY_PAUSE", 0.2)
     points = [
@@ -164,8 +164,8 @@ async def test_boxes_that_answer_at_once(monkeypatch: pytest.MonkeyPatch) -> Non
         EvboxChargePoint(12, min_interval=0),
     ]
     async with on_wire(*points) as (virtual, bus):
-        anybody = make(0).config
-        report = await PROTOCOL.scan(bus, anybody, ORDERS, lambda _share: None)
+        any_box = make(0).config
+        report = await PROTOCOL.scan(bus, any_box, ORDERS, lambda _share: None)
         assert report.found == ()
         assert report.unreadable
         assert virtual.wire.collisions
@@ -175,12 +175,12 @@ async def test_boxes_that_answer_at_once(monkeypatch: pytest.MonkeyPatch) -> Non
         assert {max(order.limits) for order in sent(virtual)} == {6.0}
 
 
-async def test_it_falls_back_when_we_are_gone() -> None:
+async def test_it_falls_back_after_the_bus_stopped() -> None:
     point = EvboxChargePoint(1923054, min_interval=0)
     async with on_wire(point) as (virtual, bus):
         charger = make(1923054)
         bus.add(charger)
-        await known(virtual, charger)
+        await orders_sent(virtual, charger)
         assert point.limits_in_force == (16.0, 16.0, 16.0)
         await asyncio.sleep(0)
         await bus.stop()
