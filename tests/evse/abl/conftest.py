@@ -1,19 +1,20 @@
-"""What the ABL tests share."""
+"""Fixtures of the ABL tests."""
 
 import pytest
 
 from custom_components.evse_bus.evse import bus
-from custom_components.evse_bus.evse.abl.dialogue import Dialogue, Pauses
+from custom_components.evse_bus.evse.abl.config import Pauses
+from custom_components.evse_bus.evse.abl.reader import AblReader
 
 
 @pytest.fixture(autouse=True)
 def short_reopening(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let a lost port be looked for sooner."""
+    """Reopen a lost port sooner."""
     monkeypatch.setattr(bus, "REOPEN_FIRST", 0.1)
 
 
 @pytest.fixture
 def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the virtual car wake, and the virtual box start, sooner than real ones."""
-    short = Pauses(wake=0.3, setup=0.03, boot=0.08, retry=0.2, verify=0.05)
-    monkeypatch.setattr(Dialogue, "pauses", short)
+    """Wake the virtual car, and start the virtual box, sooner than real ones."""
+    short = Pauses(wake=0.3, settings=0.03, boot=0.08, retry=0.2, verify=0.05)
+    monkeypatch.setattr(AblReader, "pauses", short)

@@ -1,6 +1,6 @@
 """A virtual bus with ABL boxes, and the library's bus on the other end of it.
 
-The witness is what was on the wire (`writes`), not what the library believes.
+The oracle is the traffic on the wire (`writes`), not the state of the library.
 """
 
 import asyncio
@@ -22,7 +22,7 @@ WRITE = 0x10
 
 PATIENCE = 10.0
 FOREVER = 1e6
-# Shorter waits for answers that never come: most tests need not sit through them.
+# Shorter time-outs, for all tests that do not measure real ones.
 QUICK = replace(
     PROTOCOL,
     timing=replace(
@@ -65,9 +65,9 @@ def orders(
 
 
 async def until(holds: Callable[[], object], patience: float = PATIENCE) -> None:
-    """Wait until something holds."""
+    """Wait until a condition holds."""
     async with asyncio.timeout(patience):
-        while not holds():  # noqa: ASYNC110 - what changes has nobody to tell
+        while not holds():  # noqa: ASYNC110 - there is no event for it
             await asyncio.sleep(0.005)
 
 
@@ -76,7 +76,7 @@ class Scene:
 
     def __init__(self, *boxes: AblBox, tcp: bool = False, quick: bool = True) -> None:
         make = VirtualBus.tcp if tcp else VirtualBus.pty
-        # A faster wire, too: what is paced as the real one is measured elsewhere.
+        # The wire is faster too.
         self.virtual = make(*boxes, baud=384_000 if quick else 38_400, parity="E")
         self.protocol = QUICK if quick else PROTOCOL
         self.boxes = boxes
@@ -106,33 +106,33 @@ class Scene:
         return charger
 
     async def settled(self, settings: AblConfig, wanted: Orders) -> AblCharger:
-        """Put a charger on the bus; return when it has said all it says at first."""
+        """Put a charger on the bus; return after its first exchanges."""
         charger = self.add(settings, wanted)
-        # Not asked for the register that most boxes do not know: silence costs 0.3 s.
-        charger.tells_icmax = False
+        # No probe of the register that most boxes lack: its time-out takes long.
+        charger.has_icmax = False
         await until(lambda: charger.available and charger.info is not None)
         await self.polled(charger)
         return charger
 
-    def lively(self, charger: AblCharger) -> None:
-        """End what `quiet` began."""
+    def resume_polls(self, charger: AblCharger) -> None:
+        """Undo `stop_polls`."""
         charger._config = replace(charger.config, poll_interval=0.01)
         charger.slot.ready = 0
         self.bus.add(charger)
 
-    async def quiet(self, charger: AblCharger) -> None:
-        """Let only commands speak from now on, so that it is known who says what."""
+    async def stop_polls(self, charger: AblCharger) -> None:
+        """Stop the polls: all traffic after this comes from commands."""
         charger._config = replace(charger.config, poll_interval=FOREVER)
         await until(lambda: charger.slot.ready > FOREVER)
 
     async def polled(self, charger: AblCharger, times: int = 2) -> None:
-        """Wait for readings that began after this call."""
-        seen = len(self.reads(charger.config.address)) + times
-        await until(lambda: len(self.reads(charger.config.address)) >= seen)
+        """Wait for polls that began after this call."""
+        reads = len(self.reads(charger.config.address)) + times
+        await until(lambda: len(self.reads(charger.config.address)) >= reads)
         await asyncio.sleep(0)
 
     def requests(self) -> list[Request]:
-        """Return every request that was on the wire."""
+        """Return all requests on the wire."""
         return requests_in(self.virtual.log.bursts())
 
     def reads(self, address: int, register: int = READING) -> list[Request]:
@@ -155,7 +155,7 @@ class Scene:
 
 
 def sleepy() -> Car:
-    """Return a car that is plugged in, may charge, and takes nothing."""
+    """Return a car that is plugged in, may charge, and draws nothing."""
     car = Car(ramp=0.1, reaction=0.0)
     car.plug_in(request=False)
     return car
@@ -166,7 +166,7 @@ def box_with(car: Car | None = None, **settings: object) -> AblBox:
 
 
 def answers(box: AblBox, *fates: str | bytes) -> None:
-    """Say what becomes of the next answers: good, lose, or other bytes instead."""
+    """Set the fate of the next replies: good, lose, or other bytes instead."""
     for fate in fates:
         if fate == "good":
             box.faults.once("noise", b"")

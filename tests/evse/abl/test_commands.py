@@ -1,10 +1,11 @@
-"""Commands: said once, verified, and what they change on the way changed back."""
+"""Commands: written once, verified, and temporary states ended again."""
 
 import asyncio
 
 import pytest
 
-from custom_components.evse_bus.evse.abl.dialogue import Dialogue, Pauses
+from custom_components.evse_bus.evse.abl.config import Pauses
+from custom_components.evse_bus.evse.abl.reader import AblReader
 from custom_components.evse_bus.evse.errors import (
     EvseError,
     NotAvailableError,
@@ -47,7 +48,7 @@ async def test_outlet_off_and_on() -> None:
         await charger.command(Command.SET_OUTLET, value=True)
         assert box.state != "E0"
         await charger.command(Command.SET_OUTLET, value=True)
-        # Said once each: what is so already is not said again.
+        # Once each: a state that is reached already is not written again.
         assert scene.writes() == [E0, A1]
         assert charger.reading.outlet_enabled is True
 
@@ -72,23 +73,23 @@ async def test_a_paused_outlet_is_enabled_and_stays_paused() -> None:
         assert box.ic_amps == 0
 
 
-async def test_a_lost_answer_is_settled_by_the_state() -> None:
+async def test_after_a_lost_reply_the_state_decides() -> None:
     box = box_with()
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders())
-        await scene.quiet(charger)
-        # The look before, and the answer to the write.
+        await scene.stop_polls(charger)
+        # The status, and the reply to the write.
         answers(box, "good", "lose")
         await charger.command(Command.SET_OUTLET, value=False)
         assert box.state == "E0"
         assert scene.writes() == [E0]
 
 
-async def test_a_lost_request_is_said_again() -> None:
+async def test_a_lost_request_is_repeated() -> None:
     box = box_with()
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders())
-        await scene.quiet(charger)
+        await scene.stop_polls(charger)
         answer = box._answer
         lost = []
 
@@ -118,7 +119,7 @@ async def test_an_outlet_that_does_not_follow() -> None:
 
 
 @pytest.mark.parametrize("value", [None, 1, "on"])
-async def test_an_outlet_is_on_or_off(value: object) -> None:
+async def test_an_outlet_accepts_only_on_and_off(value: object) -> None:
     async with Scene(box_with()) as scene:
         charger = await scene.settled(config(), orders())
         with pytest.raises(RefusedOrderError):
@@ -130,7 +131,7 @@ async def test_an_outlet_is_on_or_off(value: object) -> None:
 
 
 async def test_a_car_is_woken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Dialogue, "pauses", Pauses())
+    monkeypatch.setattr(AblReader, "pauses", Pauses())
     box = box_with(sleepy())
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders())
@@ -138,12 +139,15 @@ async def test_a_car_is_woken(monkeypatch: pytest.MonkeyPatch) -> None:
         await scene.polled(charger)
         await charger.command(Command.WAKE)
         assert scene.writes() == [E0, A1]
-        times = [one.t for one in scene.requests() if one.register == STATE]
-        assert 3.0 <= times[1] - times[0] <= 3.5
-        # The others were heard meanwhile: it did not hold the bus.
+        disabled, enabled = (one.t for one in scene.requests() if one.register == STATE)
+        assert enabled - disabled >= 3.0
+        # Not later than a poll under way and the status before the write.
+        late = [one for one in scene.reads(1) if disabled + 3.0 < one.t < enabled]
+        assert len(late) <= 4
+        # Polls went on meanwhile: the command did not hold the bus.
         assert len(scene.reads(1)) > 20
         assert box.state != "E0"
-        assert charger.owes is None
+        assert charger.pending_cleanup is None
 
 
 async def test_only_a_car_that_may_charge_is_woken() -> None:
@@ -180,7 +184,7 @@ async def test_a_stop_waits_until_the_outlet_is_enabled_again() -> None:
         assert box.state != "E0"
 
 
-async def test_a_lost_port_delays_the_end_and_does_not_forget_it() -> None:
+async def test_after_a_lost_port_the_outlet_is_still_enabled_again() -> None:
     box = box_with(sleepy())
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders())
@@ -196,13 +200,13 @@ async def test_a_lost_port_delays_the_end_and_does_not_forget_it() -> None:
         assert scene.writes() == [E0, A1]
 
 
-async def test_waking_ends_well_though_answers_are_lost() -> None:
+async def test_a_car_is_woken_though_replies_are_lost() -> None:
     box = box_with(sleepy())
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders())
         await until(lambda: box.state == "B2")
-        await scene.quiet(charger)
-        # The look before, E0, the state: it was taken; the state again, A1.
+        await scene.stop_polls(charger)
+        # The status, E0, the status (E0 was taken), the status again, A1.
         answers(box, "good", "lose", "good", "good", "lose")
         await charger.command(Command.WAKE)
         assert scene.writes() == [E0, A1]
@@ -260,19 +264,19 @@ async def test_a_reset_clears_a_failure() -> None:
         charger = await scene.settled(config(), orders())
         box.fail(3)
         await until(lambda: Fault.DC_RESIDUAL_CURRENT in charger.faults)
-        await scene.quiet(charger)
+        await scene.stop_polls(charger)
         answers(box, "good", "lose")
-        # The answer is lost, the state says that it happened.
+        # The reply is lost; the state shows that the reset happened.
         await charger.command(Command.RESET)
         assert box.resets == 1
         assert not charger.faults
 
 
-async def test_a_reset_whose_answer_is_lost_is_not_repeated() -> None:
+async def test_a_reset_whose_reply_is_lost_is_not_repeated() -> None:
     box = box_with()
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders())
-        await scene.quiet(charger)
+        await scene.stop_polls(charger)
         answers(box, "good", "lose")
         with pytest.raises(NotConfirmedError, match="not repeated"):
             await charger.command(Command.RESET)
@@ -284,7 +288,7 @@ async def test_a_command_for_a_sleeping_box() -> None:
     box = box_with(sleep_after=1.0, wake_time=0.1)
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders())
-        await scene.quiet(charger)
+        await scene.stop_polls(charger)
         await until(lambda: box.asleep)
         await charger.command(Command.RESET)
         assert box.resets == 1
@@ -294,7 +298,7 @@ async def test_a_command_for_a_dead_box() -> None:
     box = box_with()
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders())
-        await scene.quiet(charger)
+        await scene.stop_polls(charger)
         box.faults.dead = True
         with pytest.raises((ReplyTimeoutError, NotConfirmedError)):
             await charger.command(Command.RESET)

@@ -1,4 +1,4 @@
-"""Ampere and duty cycle: never more than was asked."""
+"""Current and duty cycle: never more than ordered."""
 
 from decimal import Decimal
 
@@ -70,13 +70,13 @@ def test_currents(duty: int, current: float | None) -> None:
 
 
 @pytest.mark.parametrize("current", [-1, 0.1, 5.99, float("nan")])
-def test_what_no_duty_cycle_offers_is_refused(current: float) -> None:
+def test_a_current_without_a_duty_cycle_is_refused(current: float) -> None:
     with pytest.raises(RefusedOrderError):
         duty_for(current)
 
 
 @given(_tenths)
-def test_never_above_what_was_asked_and_close_below(current: float) -> None:
+def test_never_above_the_order_and_close_below(current: float) -> None:
     offered = current_for(duty_for(current))
     assert offered is not None
     assert 6 <= offered <= current
@@ -100,12 +100,12 @@ def test_a_higher_current_is_never_a_lower_duty_cycle(one: float, two: float) ->
 
 
 @given(st.integers(0, 0xFFF), _tenths)
-def test_a_duty_cycle_within_offers_no_more(duty: int, wish: float) -> None:
+def test_a_duty_cycle_within_offers_no_more(duty: int, ordered: float) -> None:
     offered = current_for(duty)
-    if is_within(duty, duty_for(wish)):
-        assert offered is None or offered <= wish
+    if is_within(duty, duty_for(ordered)):
+        assert offered is None or offered <= ordered
     elif offered is not None:
-        assert offered >= current_for(duty_for(wish))  # type: ignore[operator]
+        assert offered >= current_for(duty_for(ordered))  # type: ignore[operator]
 
 
 @given(st.integers(0, 0xFFF))

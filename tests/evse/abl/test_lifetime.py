@@ -1,4 +1,4 @@
-"""Orders that nobody renews become the fail-safe, and start nothing."""
+"""Orders that are not renewed become the fail-safe, and start nothing."""
 
 from custom_components.evse_bus.evse.model import (
     OrderChange,
@@ -22,7 +22,7 @@ def plugged() -> Car:
     return car
 
 
-async def test_orders_that_nobody_renews_become_the_fail_safe() -> None:
+async def test_orders_that_are_not_renewed_become_the_fail_safe() -> None:
     box = AblBox(1, car=plugged())
     async with Scene(box) as scene:
         charger = await scene.settled(
@@ -50,7 +50,7 @@ async def test_a_higher_fail_safe_is_written_once() -> None:
         assert scene.writes() == [100, 166]
 
 
-async def test_no_passing_of_time_starts_a_stopped_car() -> None:
+async def test_expired_orders_start_no_stopped_car() -> None:
     box = AblBox(1, car=plugged())
     async with Scene(box) as scene:
         charger = await scene.settled(
@@ -61,7 +61,7 @@ async def test_no_passing_of_time_starts_a_stopped_car() -> None:
         assert scene.writes() == [PAUSE]
 
 
-async def test_a_fail_safe_of_nothing_ends_with_the_next_limit() -> None:
+async def test_a_fail_safe_of_0_a_ends_with_the_next_limit() -> None:
     box = AblBox(1, car=plugged())
     async with Scene(box) as scene:
         charger = await scene.settled(
@@ -73,7 +73,7 @@ async def test_a_fail_safe_of_nothing_ends_with_the_next_limit() -> None:
         assert scene.writes() == [166, PAUSE, 166]
 
 
-async def test_a_new_fail_safe_renews_nothing() -> None:
+async def test_a_new_fail_safe_does_not_renew_the_orders() -> None:
     box = AblBox(1, car=plugged())
     async with Scene(box) as scene:
         charger = await scene.settled(

@@ -1,4 +1,4 @@
-"""Orders and a box: what reaches the wire, and what must not."""
+"""Orders and a box: writes that reach the wire, and writes that must not."""
 
 import asyncio
 from contextlib import suppress
@@ -55,7 +55,7 @@ async def test_a_limit_that_stands_is_not_written_again() -> None:
         assert scene.writes() == [166]
 
 
-async def test_a_pause_is_the_real_one_and_ends_by_the_switch() -> None:
+async def test_a_pause_keeps_plug_detection_and_ends_by_the_switch() -> None:
     box = AblBox(1, car=plugged())
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders(allowed=True))
@@ -66,7 +66,7 @@ async def test_a_pause_is_the_real_one_and_ends_by_the_switch() -> None:
         assert charger.reading is not None
         assert charger.reading.allowed is False
         assert charger.reading.offered_current == 0
-        # The cable is still seen.
+        # The cable is still detected.
         connector = charger.reading.connectors[1]
         assert (connector.plugged, connector.status) == (True, Status.SUSPENDED_EVSE)
         await charger.change_orders(ON)
@@ -74,7 +74,7 @@ async def test_a_pause_is_the_real_one_and_ends_by_the_switch() -> None:
         await until(lambda: box.state == "C2")
 
 
-async def test_a_slider_moved_while_paused_is_stored_and_writes_nothing() -> None:
+async def test_a_limit_changed_while_paused_is_only_stored() -> None:
     async with Scene(AblBox(1, car=plugged())) as scene:
         charger = await scene.settled(config(), orders(allowed=False))
         await until(lambda: scene.writes() == [PAUSE])
@@ -89,7 +89,7 @@ async def test_a_slider_moved_while_paused_is_stored_and_writes_nothing() -> Non
 
 
 @pytest.mark.parametrize("allowed", [None, True])
-async def test_a_slider_does_not_start_what_somebody_else_has_paused(
+async def test_a_limit_does_not_end_a_pause_by_others(
     allowed: bool | None,  # noqa: FBT001
 ) -> None:
     box = AblBox(1, car=plugged())
@@ -108,7 +108,7 @@ async def test_a_slider_does_not_start_what_somebody_else_has_paused(
         assert scene.writes() == [166]
 
 
-async def test_a_limit_in_e0_is_lowered_only() -> None:
+async def test_a_limit_in_e0_is_only_lowered() -> None:
     box = AblBox(1, car=plugged())
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders(10))
@@ -126,22 +126,22 @@ async def test_a_limit_in_e0_is_lowered_only() -> None:
         assert scene.writes() == [166, 133]
 
 
-async def test_nothing_is_written_while_a_box_is_being_set_up() -> None:
+async def test_nothing_is_written_in_set_up_mode() -> None:
     box = AblBox(1)
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders())
         box.outlet.go("E2")
         await scene.polled(charger)
-        with pytest.raises(NotAvailableError, match="set up"):
+        with pytest.raises(NotAvailableError, match="set-up mode"):
             await charger.change_orders(limit(10))
         await scene.polled(charger)
         assert scene.writes() == []
-        # The lowering stands, and is sent as soon as it can be.
+        # The lowering stands, and is sent as soon as possible.
         box.outlet.go("A1")
         await until(lambda: scene.writes() == [166])
 
 
-async def test_after_a_power_cycle_the_limit_is_asserted_at_once() -> None:
+async def test_after_a_power_cycle_the_limit_is_reasserted_at_once() -> None:
     box = AblBox(1, boot_time=0.1)
     async with Scene(box) as scene:
         charger = await scene.settled(config(poll_interval=0.2), orders(10))
@@ -152,13 +152,13 @@ async def test_after_a_power_cycle_the_limit_is_asserted_at_once() -> None:
         await scene.polled(charger)
         assert charger.statistics.reasserted == 1
         assert Fault.LIMIT_NOT_TAKEN not in charger.faults
-        # Between reading it above and writing there is no other exchange.
+        # No other exchange between the status above the limit and the write.
         registers = [one.register for one in scene.requests() if one.device_id == 1]
         second = len(registers) - 1 - registers[::-1].index(LIMIT)
         assert registers[second - 1 : second + 2] == [0x2E, LIMIT, 0x2E]
 
 
-async def test_after_a_power_cycle_a_pause_is_asserted_too() -> None:
+async def test_after_a_power_cycle_a_pause_is_reasserted_too() -> None:
     box = AblBox(1, car=plugged(), boot_time=0.1)
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders(allowed=False))
@@ -169,7 +169,7 @@ async def test_after_a_power_cycle_a_pause_is_asserted_too() -> None:
         assert box.ic_amps == 0
 
 
-async def test_permission_is_never_given_again_by_itself() -> None:
+async def test_permission_is_never_given_without_the_user() -> None:
     box = AblBox(1, car=plugged())
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders(allowed=True))
@@ -177,12 +177,12 @@ async def test_permission_is_never_given_again_by_itself() -> None:
         await scene.polled(charger, 5)
         box.set_by_somebody(8)
         await scene.polled(charger, 5)
-        # Neither the pause nor the lower limit of somebody else is undone.
+        # Neither a pause nor a lower limit set by others is undone.
         assert scene.writes() == []
         assert charger.orders.allowed is True
 
 
-async def test_a_lower_ic_is_shown_and_left_alone() -> None:
+async def test_a_lower_ic_is_reported_and_accepted() -> None:
     async with Scene(AblBox(1, cable_current=13, car=plugged())) as scene:
         charger = await scene.settled(config(), orders(16))
         assert charger.reading is not None
@@ -224,27 +224,27 @@ async def test_a_box_that_refuses() -> None:
     box = AblBox(1)
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders())
-        await scene.quiet(charger)
+        await scene.stop_polls(charger)
         box.faults.once("replace", b">0190046B\r\n")
         with pytest.raises(ExchangeRefusedError, match="exception 4") as caught:
             await charger.change_orders(OFF)
         assert caught.value.code == 4
         assert charger.statistics.refused == 1
         assert Fault.LIMIT_NOT_TAKEN in charger.faults
-        # The order to pause stands, and is carried out.
-        scene.lively(charger)
+        # The pause stands, and is written again.
+        scene.resume_polls(charger)
         await until(lambda: Fault.LIMIT_NOT_TAKEN not in charger.faults)
         assert box.ic_amps == 0
 
 
-async def test_lost_and_late_answers_are_settled_by_trying_again() -> None:
+async def test_after_lost_and_late_replies_a_pause_is_repeated() -> None:
     box = AblBox(1)
     async with Scene(box, quick=False) as scene:
         charger = await scene.settled(config(), orders())
-        await scene.quiet(charger)
+        await scene.stop_polls(charger)
         foreign = scene.bus.wire.statistics.foreign_frames
         box.faults.once("lose")
-        # It comes in the pause before the next try: too late to be an answer.
+        # It comes in the pause before the next attempt: too late to count.
         box.faults.once("late", 0.45)
         await charger.change_orders(OFF)
         assert box.ic_amps == 0
@@ -253,7 +253,7 @@ async def test_lost_and_late_answers_are_settled_by_trying_again() -> None:
         assert scene.bus.wire.statistics.foreign_frames == foreign + 1
 
 
-async def test_a_dead_box_makes_a_command_fail() -> None:
+async def test_a_command_to_a_dead_box_fails() -> None:
     box = AblBox(1)
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders())
@@ -284,7 +284,7 @@ async def test_a_pause_is_never_merged_away() -> None:
         )
 
 
-async def test_off_while_on_is_under_way() -> None:
+async def test_a_pause_during_a_start() -> None:
     box = AblBox(1, car=plugged())
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders(allowed=False))
@@ -300,7 +300,7 @@ async def test_off_while_on_is_under_way() -> None:
         assert charger.orders.allowed is False
 
 
-async def test_a_limit_of_nothing_pauses_and_a_limit_ends_it() -> None:
+async def test_a_limit_of_0_a_pauses_and_another_limit_ends_it() -> None:
     box = AblBox(1, car=plugged())
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders(allowed=True))
@@ -308,14 +308,14 @@ async def test_a_limit_of_nothing_pauses_and_a_limit_ends_it() -> None:
         assert box.ic_amps == 0
         await charger.change_orders(limit(10))
         assert scene.writes() == [PAUSE, 166]
-        # Not what the switch has paused, though.
+        # A pause by the switch is not ended, though.
         await charger.change_orders(OFF)
         await charger.change_orders(limit(0))
         await charger.change_orders(limit(10))
         assert scene.writes() == [PAUSE, 166, PAUSE]
 
 
-async def test_absurd_wishes() -> None:
+async def test_invalid_limits_are_refused() -> None:
     async with Scene(AblBox(1)) as scene:
         charger = await scene.settled(config(), orders(10))
         for current in (float("nan"), float("inf"), -1, 10000, 5.9, 17):
@@ -356,7 +356,7 @@ _changes = st.lists(
     max_examples=8, suppress_health_check=[HealthCheck.too_slow], derandomize=True
 )
 @given(_changes)
-def test_no_sequence_of_changes_starts_what_the_switch_has_stopped(
+def test_no_sequence_of_changes_starts_a_car_stopped_by_the_switch(
     changes: list[OrderChange],
 ) -> None:
     async def scene_of() -> None:

@@ -1,4 +1,4 @@
-"""What is made of a box's answers: nothing that it did not tell."""
+"""Readings made of register contents: no value without a measurement."""
 
 from dataclasses import replace
 from math import isclose
@@ -40,7 +40,7 @@ FULL = Reading(
     duty=266,
     currents=(10.0, 9.9, 0.0),
 )
-NONE_TOLD = (None, None, None)
+NOT_MEASURED = (None, None, None)
 
 
 def snapshot(
@@ -65,8 +65,8 @@ def snapshot(
     return Snapshot(reading=reading, info=info, flags=flags)
 
 
-def read(what: Snapshot) -> tuple[ChargerReading, ConnectorReading]:
-    reading = charger_reading(what, phase_currents(what, (1, 2, 3)), None, None)
+def read(box: Snapshot) -> tuple[ChargerReading, ConnectorReading]:
+    reading = charger_reading(box, phase_currents(box, (1, 2, 3)), None, None)
     return reading, reading.connectors[1]
 
 
@@ -117,7 +117,7 @@ def test_status_and_permission(
     ("state", "expected"),
     [(0xA1, True), (0xB2, True), (0xC2, True), (0xE0, None), (0xF9, None), (0, None)],
 )
-def test_a_plug_is_told_only_where_its_bit_counts(
+def test_plugged_is_known_only_where_its_bit_is_valid(
     state: int,
     expected: bool | None,  # noqa: FBT001
 ) -> None:
@@ -127,39 +127,39 @@ def test_a_plug_is_told_only_where_its_bit_counts(
 
 
 @pytest.mark.parametrize("state", [0xA1, 0xB1, 0xB2, 0xE0])
-def test_no_value_is_zero_where_the_contactor_is_open(state: int) -> None:
-    what = snapshot(state, currents=NONE_TOLD)
-    assert read(what)[1].current == (0, 0, 0)
+def test_a_missing_current_is_zero_where_the_contactor_is_open(state: int) -> None:
+    box = snapshot(state, currents=NOT_MEASURED)
+    assert read(box)[1].current == (0, 0, 0)
 
 
 @pytest.mark.parametrize(
-    "what",
+    "box",
     [
-        pytest.param(snapshot(0xC2, currents=NONE_TOLD), id="charging"),
-        pytest.param(snapshot(0xC3, currents=NONE_TOLD), id="charging, reduced"),
-        pytest.param(snapshot(0xF1, currents=NONE_TOLD), id="welded"),
-        pytest.param(snapshot(0xA1, currents=NONE_TOLD, meter=False), id="no meter"),
+        pytest.param(snapshot(0xC2, currents=NOT_MEASURED), id="charging"),
+        pytest.param(snapshot(0xC3, currents=NOT_MEASURED), id="charging, reduced"),
+        pytest.param(snapshot(0xF1, currents=NOT_MEASURED), id="welded"),
+        pytest.param(snapshot(0xA1, currents=NOT_MEASURED, meter=False), id="no meter"),
         pytest.param(snapshot(0xA1, meter=False), id="values without a meter"),
-        pytest.param(snapshot(0xA1, currents=NONE_TOLD, flags=None), id="no flags"),
+        pytest.param(snapshot(0xA1, currents=NOT_MEASURED, flags=None), id="no flags"),
         pytest.param(
             snapshot(0xA1, flags=replace(CLEAR, meter_failed=True)), id="meter failed"
         ),
     ],
 )
-def test_no_value_is_unknown_elsewhere(what: Snapshot) -> None:
-    assert read(what)[1].current == UNKNOWN_PHASES
+def test_a_missing_current_is_unknown_elsewhere(box: Snapshot) -> None:
+    assert read(box)[1].current == UNKNOWN_PHASES
 
 
 def test_phase_order() -> None:
-    what = snapshot(currents=(1.0, 2.0, 3.0))
-    assert phase_currents(what, (1, 2, 3)) == (1, 2, 3)
+    box = snapshot(currents=(1.0, 2.0, 3.0))
+    assert phase_currents(box, (1, 2, 3)) == (1, 2, 3)
     # Ict1 measures L3, Ict2 L1, Ict3 L2.
-    assert phase_currents(what, (3, 1, 2)) == (2, 3, 1)
-    assert phase_currents(what, (3, 2, 1)) == (3, 2, 1)
+    assert phase_currents(box, (3, 1, 2)) == (2, 3, 1)
+    assert phase_currents(box, (3, 2, 1)) == (3, 2, 1)
 
 
 @pytest.mark.parametrize(
-    ("what", "faults", "codes"),
+    ("box", "faults", "codes"),
     [
         (snapshot(0xF9), {Fault.OVERCURRENT}, ("F9",)),
         (snapshot(0xFB), {Fault.CONTACTOR_OPEN}, ("F11",)),
@@ -171,8 +171,8 @@ def test_phase_order() -> None:
         (snapshot(flags=None), set(), ()),
     ],
 )
-def test_faults(what: Snapshot, faults: set[Fault], codes: tuple[str, ...]) -> None:
-    reading, _ = read(what)
+def test_faults(box: Snapshot, faults: set[Fault], codes: tuple[str, ...]) -> None:
+    reading, _ = read(box)
     assert reading.faults == faults
     assert reading.fault_codes == codes
 
@@ -224,7 +224,7 @@ def test_energy_is_summed_over_measured_time() -> None:
     estimate.add(None, 10)
     estimate.add(3000, 11)
     assert isclose(estimate.energy, 5)
-    # Longer than three intervals: nobody knows what was in between.
+    # Longer than three intervals: a gap, in which the power is unknown.
     estimate.add(3000, 27)
     assert isclose(estimate.energy, 5)
     estimate.add(3000, 28)
@@ -253,14 +253,14 @@ def test_energy_never_falls(steps: list[tuple[float | None, float]]) -> None:
 def test_any_registers_make_a_reading(
     reading: bytes, info: bytes, flags: bytes | None, order: list[int]
 ) -> None:
-    what = Snapshot(
+    box = Snapshot(
         reading=READING.decode(b"\x2e" + reading),
         info=INFO.decode(b"\x01" + info),
         flags=None if flags is None else FLAGS.decode(b"\x06" + flags),
     )
     one, two, three = order
-    currents = phase_currents(what, (one, two, three))
-    result = charger_reading(what, currents, power_of(currents, 230), 0.0)
+    currents = phase_currents(box, (one, two, three))
+    result = charger_reading(box, currents, power_of(currents, 230), 0.0)
     assert result.connectors[1].raw_state
     for current in currents:
         assert current is None or 0 <= current <= 80

@@ -1,4 +1,4 @@
-"""Registers: the manual's frames, frames of real boxes, and any bytes at all."""
+"""Registers: frames of the manual, frames of real boxes, and random bytes."""
 
 from hypothesis import given, strategies as st
 import pytest
@@ -239,7 +239,7 @@ def test_icmax() -> None:
     assert ICMAX.decode(bytes.fromhex("0FA100000000F10A0000")).duty == 0x10A
 
 
-# -- Any bytes -----------------------------------------------------------------------
+# -- Random bytes --------------------------------------------------------------------
 
 
 @given(st.binary(min_size=9, max_size=9))
@@ -265,7 +265,7 @@ def test_any_block_can_be_decoded(short: bytes, long: bytes) -> None:
     st.integers(0, 0xFFF),
     st.tuples(*[st.one_of(st.none(), st.integers(0, 800))] * 3),
 )
-def test_a_reading_comes_back_as_it_was_put_in(
+def test_a_reading_is_decoded_as_it_was_encoded(
     state: int,
     plugged: bool,  # noqa: FBT001
     duty: int,
@@ -294,11 +294,11 @@ def test_any_frame_can_be_offered(content: bytes) -> None:
             assert frame.function in (0x83, 0x90)
 
 
-# -- What may be written -------------------------------------------------------------
+# -- Writes --------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("address", [0, 17, 255, -1])
-def test_nothing_is_said_to_all_or_nobody(address: int) -> None:
+def test_there_are_no_requests_to_invalid_addresses(address: int) -> None:
     for encode in (
         lambda: read_request(address, READING.block),
         lambda: write_limit(address, setpoint(10)),
@@ -310,7 +310,7 @@ def test_nothing_is_said_to_all_or_nobody(address: int) -> None:
             encode()
 
 
-def test_set_up() -> None:
+def test_configuration() -> None:
     def value(**settings: bool) -> str:
         (frame,) = AsciiFramer().feed(write_configuration(1, 2, **settings))
         assert frame.data[:5] == bytes.fromhex("002C000102")
@@ -324,16 +324,16 @@ def test_set_up() -> None:
 
 
 @given(st.floats(0, 200), st.floats(6, 80))
-def test_a_limit_is_a_pause_or_within_what_was_asked(
-    wish: float, ceiling: float
+def test_a_limit_is_a_pause_or_within_the_orders(
+    ordered: float, ceiling: float
 ) -> None:
-    orders = Orders(limit=CurrentLimit(current=wish))
+    orders = Orders(limit=CurrentLimit(current=ordered))
     point = clamp(orders, Limits(installation=ceiling))
     duty = limit_duty(point)
     if point.paused:
         assert duty == 1000
     else:
-        assert duty * 0.06 <= min(wish, ceiling) + 1e-9 or duty > 850
+        assert duty * 0.06 <= min(ordered, ceiling) + 1e-9 or duty > 850
         assert 100 <= duty <= 960
 
 

@@ -1,4 +1,4 @@
-"""The state byte: what each says, and that none makes it fail."""
+"""The state byte: the meaning of each, and any unknown one."""
 
 from hypothesis import given, strategies as st
 import pytest
@@ -6,7 +6,7 @@ import pytest
 from custom_components.evse_bus.evse.abl.states import STATES, state_of
 from custom_components.evse_bus.evse.model import Fault, Status
 
-# (byte, name, status, charging, outlet enabled, bit 63 counts)
+# (byte, name, status, charging, outlet enabled, bit 63 is valid)
 KNOWN = [
     (0xA1, "A1", Status.AVAILABLE, False, True, True),
     (0xB1, "B1", Status.PREPARING, False, True, True),
@@ -46,7 +46,7 @@ def test_states(expected: tuple[object, ...]) -> None:
         state.status,
         state.charging,
         state.outlet_enabled,
-        state.tells_plugged,
+        state.plugged_valid,
     )
 
 

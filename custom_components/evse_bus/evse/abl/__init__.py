@@ -6,7 +6,7 @@ from ..framing import LineSettings
 from ..modbus import AsciiFramer
 from ..protocol import Protocol
 from .charger import AblCharger
-from .reader import TIMING, AblConfig
+from .config import TIMING, AblConfig
 from .scan import scan
 
 PROTOCOL: Final = Protocol(

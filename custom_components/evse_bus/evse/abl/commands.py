@@ -1,12 +1,10 @@
-"""What an ABL box can be told beside its orders, each as one conversation.
+"""Commands of an ABL wallbox beside its orders, each as one conversation.
 
-Register 0x0005 is never written twice for one wish: after a lost answer the state is
-read, and decides. What a conversation has changed on its way (E0, E2) it changes
-back, also when something fails.
+A state that a command brings about on its way (E0, E2) is ended again, also after an
+error: until then it is the reader's `pending_cleanup`.
 """
 
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 
 from ..conversation import Conversation, rest
@@ -19,168 +17,117 @@ from ..errors import (
 )
 from ..exchange import Turn
 from ..model import Command, Persistence
-from .dialogue import Dialogue
 from .duty import PAUSE
-from .reader import AblReader, Debt
-from .registers import (
-    ADDRESSES,
-    StateCode,
-    limit_duty,
-)
-from .setup import Settings, SetUp
+from .reader import AblReader, Cleanup
+from .registers import ADDRESSES, StateCode, limit_duty
+from .settings import Settings, change_settings
 from .states import B2, E0, E2, state_of
+from .steps import disable, lower_limit, reach, reach_state, recover, refuse_in, restore
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Busy:
-    """The one command under way."""
+def conversation_for(
+    reader: AblReader, command: Command, value: object
+) -> tuple[Conversation, Persistence]:
+    """Return the conversation that carries out a command, and how it may be repeated.
 
-    what: str
+    Raises RefusedOrderError for an invalid value, NotAvailableError for a command that
+    an ABL box does not have.
+    """
+    match command:
+        case Command.RESET:
+            return partial(_reset, reader), Persistence.ONCE
+        case Command.WAKE:
+            return partial(_wake, reader), Persistence.ONCE
+        case Command.SET_OUTLET:
+            enable = _on_or_off(command, value)
+            outlet = _enable_outlet if enable else _disable_outlet
+            # Either reads the state first, so a repeat changes nothing.
+            return partial(outlet, reader), Persistence.REPEATABLE
+        case Command.SET_ADDRESS:
+            settings = Settings(device_id=_device_id(value))
+        case Command.SET_UPSTREAM_TIMEOUT:
+            settings = Settings(upstream_timeout=_on_or_off(command, value))
+        case Command.SET_ENABLE_AFTER_POWER_CYCLE:
+            settings = Settings(needs_enable=not _on_or_off(command, value))
+        case _:
+            message = f"{reader.config.name} has no command {command}"
+            raise NotAvailableError(message)
+    return partial(change_settings, reader, settings), Persistence.ONCE
 
 
-class CommandSet(Dialogue):
-    """The commands of one charger; one at a time."""
+# -- Outlet --------------------------------------------------------------------------
 
-    def __init__(self, charger: AblReader) -> None:
-        """Take the charger, for its identity, its readings and its limit."""
-        super().__init__(charger)
-        self._set_up = SetUp(charger)
-        self._busy: _Busy | None = None
 
-    def conversation(
-        self, command: Command, value: object
-    ) -> tuple[Conversation, Persistence]:
-        """Return what carries out a command, and how often it may be begun.
+async def _disable_outlet(reader: AblReader, turn: Turn) -> None:
+    await disable(reader, turn, await reach(reader, turn))
 
-        Raises RefusedOrderError for a value that the command cannot have, and
-        NotAvailableError for a command that an ABL box does not know.
-        """
-        turns, persistence = self._turns(command, value)
-        return self._one_at_a_time(command, turns), persistence
 
-    def _turns(
-        self, command: Command, value: object
-    ) -> tuple[Conversation, Persistence]:
-        match command:
-            case Command.RESET:
-                return self._reset, Persistence.ONCE
-            case Command.WAKE:
-                return self._wake, Persistence.ONCE
-            case Command.SET_OUTLET:
-                turns = partial(self._set_outlet, _on_or_off(command, value))
-                # It begins with a look at the state: twice does what once does.
-                return turns, Persistence.REPEATABLE
-            case Command.SET_ADDRESS:
-                settings = Settings(device_id=_device_id(value))
-            case Command.SET_UPSTREAM_TIMEOUT:
-                settings = Settings(upstream_timeout=_on_or_off(command, value))
-            case Command.SET_ENABLE_AFTER_POWER_CYCLE:
-                settings = Settings(needs_enable=not _on_or_off(command, value))
-            case _:
-                message = f"{self._charger.config.name} knows no command {command}"
-                raise NotAvailableError(message)
-        return partial(self._set_up.run, settings), Persistence.ONCE
-
-    def release(self) -> None:
-        """Forget the command under way: it was cut short."""
-        self._busy = None
-
-    def _one_at_a_time(
-        self, command: Command | None, turns: Conversation
-    ) -> Conversation:
-        async def conversation(turn: Turn) -> None:
-            if self._busy is not None:
-                message = f"{self._charger.config.name} is busy: {self._busy.what}"
-                raise NotAvailableError(message)
-            self._busy = mine = _Busy(command or "tidying up")
-            try:
-                with self._charger.conversing():
-                    await turns(turn)
-            finally:
-                if self._busy is mine:
-                    self._busy = None
-                self._charger.updated()
-
-        return conversation
-
-    # -- Outlet ------------------------------------------------------------------
-
-    async def _set_outlet(self, enabled: bool, turn: Turn) -> None:  # noqa: FBT001
-        await self._reach(turn)
-        reading = self._state()
-        if enabled:
-            if state_of(reading.state).outlet_enabled is not True:
-                if reading.state not in (E0, E2):
-                    raise self._refuse_in(reading, "only E0 and E2 can be left")
-                await self._enable(turn)
-            self._charger.owes = None
-        else:
-            await self._disable(turn)
-
-    async def _enable(self, turn: Turn) -> None:
-        """Enable the outlet, with the limit that stands."""
-        charger = self._charger
-        paused = self._state().duty == PAUSE
-        await self._limit_first(turn)
-        await self._reach_state(
-            turn, StateCode.A1, lambda now: now.state not in (E0, E2)
+async def _enable_outlet(reader: AblReader, turn: Turn) -> None:
+    status = await reach(reader, turn)
+    if state_of(status.state).outlet_enabled is not True:
+        if status.state not in (E0, E2):
+            raise refuse_in(reader, status, "an outlet is enabled in E0 or E2")
+        was_paused = status.duty == PAUSE
+        await lower_limit(reader, turn, status)
+        status = await reach_state(
+            reader, turn, StateCode.A1, lambda now: now.state not in (E0, E2)
         )
-        if not paused and self._state().duty < limit_duty(charger.setpoint) != PAUSE:
+        if not was_paused and status.duty < limit_duty(reader.setpoint) != PAUSE:
             # Limits raised while the outlet was disabled have only been stored.
-            await charger.enforce(turn, lambda: charger.setpoint)
+            await reader.apply_setpoint(turn, lambda: reader.setpoint)
+    reader.pending_cleanup = None
 
-    # -- Waking a car ------------------------------------------------------------
 
-    async def _wake(self, turn: Turn) -> None:
-        await self._reach(turn)
-        charger = self._charger
-        reading = self._state()
-        if reading.state != B2:
-            raise self._refuse_in(reading, "only a car that may charge can be woken")
-        if reading.duty == PAUSE or charger.setpoint.paused:
-            raise self._refuse_in(reading, "charging is paused, waking would not help")
-        charger.owes = Debt(StateCode.A1, E0)
-        try:
-            confirmed = await self._say(turn, StateCode.E0)
-        except ExchangeRefusedError:
-            charger.owes = None
-            raise
-        if not confirmed:
-            # If the state is not told either, E0 must be assumed.
-            with suppress(ReplyTimeoutError):
-                if (await charger.look(turn)).state != E0:
-                    charger.owes = None
-                    message = f"{charger.config.name} did not take E0"
-                    raise NotConfirmedError(message)
-        await rest(self.pauses.wake)
-        await self._give_back(turn)
+# -- Waking a car --------------------------------------------------------------------
 
-    async def give_back(self, turn: Turn) -> None:
-        """Finish what a command that was cut short has left undone."""
-        await self._one_at_a_time(None, self._give_back)(turn)
 
-    # -- Reset -------------------------------------------------------------------
+async def _wake(reader: AblReader, turn: Turn) -> None:
+    status = await reach(reader, turn)
+    if status.state != B2:
+        raise refuse_in(reader, status, "only a car that may charge can be woken")
+    if status.duty == PAUSE or reader.setpoint.paused:
+        raise refuse_in(reader, status, "charging is paused, waking would not help")
+    reader.pending_cleanup = Cleanup(StateCode.A1, E0)
+    try:
+        confirmed = await reader.set_state(turn, StateCode.E0)
+    except ExchangeRefusedError:
+        reader.pending_cleanup = None
+        raise
+    if not confirmed:
+        # If the state cannot be read either, it may be E0.
+        with suppress(ReplyTimeoutError):
+            if (await reader.read_status(turn)).state != E0:
+                reader.pending_cleanup = None
+                message = f"{reader.config.name} does not change to E0"
+                raise NotConfirmedError(message)
+    await rest(reader.pauses.wake)
+    await restore(reader, turn)
 
-    async def _reset(self, turn: Turn) -> None:
-        await self._reach(turn)
-        before = self._state()
-        if before.state == E0:
-            self._charger.owes = Debt(StateCode.E0)
-        self._hold_polls(turn)
-        confirmed = await self._say(turn, StateCode.RESET)
-        await self._after_reset(turn, was_disabled=before.state == E0)
-        after = self._state()
-        if not confirmed and (after.state, after.duty) == (before.state, before.duty):
-            message = (
-                f"{self._charger.config.name}: the answer to the reset was lost, and "
-                "nothing shows whether it happened; it was not repeated"
-            )
-            raise NotConfirmedError(message)
+
+# -- Reset ---------------------------------------------------------------------------
+
+
+async def _reset(reader: AblReader, turn: Turn) -> None:
+    before = await reach(reader, turn)
+    was_disabled = before.state == E0
+    if was_disabled:
+        reader.pending_cleanup = Cleanup(StateCode.E0)
+    confirmed = await reader.set_state(turn, StateCode.RESET)
+    after = await recover(reader, turn, was_disabled=was_disabled)
+    if not confirmed and (after.state, after.duty) == (before.state, before.duty):
+        message = (
+            f"{reader.config.name}: no reply to the reset, and no sign that it "
+            "happened; it was not repeated"
+        )
+        raise NotConfirmedError(message)
+
+
+# -- Values --------------------------------------------------------------------------
 
 
 def _on_or_off(command: Command, value: object) -> bool:
     if not isinstance(value, bool):
-        message = f"{command} takes on or off, not {value!r}"
+        message = f"{command} must be on or off, not {value!r}"
         raise RefusedOrderError(message)
     return value
 

@@ -1,12 +1,12 @@
-"""What is known of one ABL box, and how it is asked.
+"""Exchanges with one ABL wallbox, and the state read from it.
 
-Who answers is checked anew after each (re)connect and after each missed answer,
-before anything else is said. PROTOCOLS.md, 2.
+The identity is checked after each (re)connect and after each missed reply, before
+anything else is exchanged (PROTOCOLS.md, 2).
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, override
+from typing import ClassVar, Final, override
 
 from ..charger import Charger
 from ..conversation import rest
@@ -18,11 +18,11 @@ from ..errors import (
     WrongChargerError,
 )
 from ..exchange import Turn
-from ..framing import Timing
-from ..model import Capability, ChargerConfig, Fault, Limits, Orders, Phases
+from ..model import ChargerConfig, Fault, Orders
+from ..registers import Registers
 from ..safety import Setpoint
+from .config import TIMING, AblConfig, Pauses
 from .duty import PAUSE, is_within
-from .exchanges import read, set_limit
 from .readings import (
     EnergyEstimate,
     Snapshot,
@@ -32,105 +32,88 @@ from .readings import (
     power_of,
 )
 from .registers import (
+    CONFIGURATION_REGISTER,
     FLAGS,
     ICMAX,
     INFO,
-    LONGEST_REPLY,
+    LIMIT_REGISTER,
     LONGEST_REQUEST,
     READING,
     SERIAL,
+    STATE_REGISTER,
     Flags,
     Info,
     Reading,
     StateCode,
     limit_duty,
+    read_answer,
+    read_request,
+    write_answer,
+    write_configuration,
+    write_limit,
+    write_state,
 )
 from .states import E0
 
-TIMING: Final = Timing(
-    # A box answers within some milliseconds; network adapters take longer.
-    reply_timeout=0.3,
-    longest_reply=LONGEST_REPLY,
-    # The first request after an idle time is lost; the repeat comes 0.7 s after it.
-    retry_pauses=(0.4, 1.0),
-)
-
 FLAGS_INTERVAL: Final = 30.0
-"""Time between two readings of the system flags, s."""
+"""Time between two reads of the system flags, s."""
 FLAGS_MISSES: Final = 3
-"""Flags left unanswered in a row until the old ones no longer count."""
+"""Unanswered reads of the flags in a row after which the old flags are dropped."""
 
-WRITES: Final = 2
-"""How often a limit is written until it must be read back."""
+LIMIT_WRITES: Final = 2
+"""Writes of a limit before it counts as not taken."""
 SETTLING: Final = 0.25
-"""Time a box is given to follow a limit that is not read back at once, s."""
-
-_CAPABILITIES: Final = frozenset(
-    {
-        Capability.STATUS,
-        Capability.RAW_STATE,
-        Capability.PLUGGED,
-        Capability.CHARGING,
-        Capability.OFFERED_CURRENT,
-        Capability.FAULTS,
-        Capability.UPSTREAM_TIMEOUT,
-        Capability.ENABLE_AFTER_POWER_CYCLE,
-        Capability.OUTLET_ENABLED,
-        Capability.RESET,
-        Capability.WAKE,
-        Capability.SET_ADDRESS,
-    }
-)
-_WITH_METER: Final = frozenset(
-    {Capability.CURRENT, Capability.ESTIMATED_POWER, Capability.ESTIMATED_ENERGY}
-)
+"""Time for a limit that is not read back at once, s."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AblConfig(ChargerConfig):
-    """What the user set up for one ABL wallbox."""
+async def read[T](
+    turn: Turn, address: int, registers: Registers[T], *, attempts: int = 1
+) -> T:
+    """Return the contents of a block; raises what `Turn.exchange` raises.
 
-    poll_interval: float = 2.0
-    """s: it falls asleep when idle, and forgets its limit with each power failure."""
-    phase_order: Phases[int] = (1, 2, 3)
-    """The phase that each of Ict1, Ict2, Ict3 measures; some boxes begin with L3."""
-
-    def __post_init__(self) -> None:
-        """Raise ValueError for what is no order of three phases."""
-        if sorted(self.phase_order) != [1, 2, 3]:
-            message = f"{self.phase_order} is no order of the phases 1, 2, 3"
-            raise ValueError(message)
+    More than one attempt is for a box known to be awake: its reply was disturbed, and
+    an immediate repeat helps.
+    """
+    request = read_request(address, registers.block)
+    answer = read_answer(address, registers.block)
+    for _ in range(attempts - 1):
+        try:
+            return registers.decode(await turn.exchange(request, answer))
+        except ReplyTimeoutError:
+            continue
+    return registers.decode(await turn.exchange(request, answer))
 
 
 @dataclass(frozen=True, slots=True)
-class Debt:
-    """A state that a command brings about on its way, and what ends it."""
+class Cleanup:
+    """A state that a command passes through, and the code that ends it."""
 
-    end: StateCode
+    code: StateCode
     state: int | None = None
-    """``None``: any but E0 (a disabled outlet that is being reset)."""
+    """``None``: any but E0 (the reset of a disabled outlet enables it)."""
 
-    def is_open(self, state: int) -> bool:
-        """Return whether a box in this state still has to be led out of it."""
+    def is_needed(self, state: int) -> bool:
+        """Return whether a box in this state must still be led out of it."""
         return state != E0 if self.state is None else state == self.state
 
 
 class AblReader(Charger[AblConfig]):
-    """One ABL wallbox, as far as it is asked and not told."""
+    """One ABL wallbox: its exchanges, and the state read so far."""
 
     timing = TIMING
+    pauses: ClassVar[Pauses] = Pauses()
 
     def __init__(self, config: AblConfig, orders: Orders) -> None:
-        """Take the set-up; the box is not known before it answers."""
+        """Nothing is known of the box before its first reply."""
         super().__init__(config, orders)
-        self.raw: Reading | None = None
-        """What 0x002E told last, undecided."""
-        self.tells_icmax: bool | None = None
-        """Whether it knows register 0x000F; ``None``: not asked yet."""
-        self.owes: Debt | None = None
-        """A state that we brought about on the way, and have not ended yet."""
+        self.last_status: Reading | None = None
+        """Contents of 0x002E, as read last."""
+        self.has_icmax: bool | None = None
+        """It answers reads of 0x000F; ``None``: not tried yet."""
         self.confirmed: int | None = None
-        """The duty cycle that was read back last, as it was written."""
+        """Duty cycle (0.1 %) of the last limit that was read back."""
+        self.pending_cleanup: Cleanup | None = None
+        """State that a command brought about and has not ended yet."""
         self._serial: str | None = None
         self._info: Info | None = None
         self._flags: Flags | None = None
@@ -146,20 +129,9 @@ class AblReader(Charger[AblConfig]):
         self._energy.set_interval(config.poll_interval)
 
     @property
-    @override
-    def capabilities(self) -> frozenset[Capability]:
-        known = _CAPABILITIES
-        if self._info is not None and self._info.meter:
-            known |= _WITH_METER
-        if self.config.order_lifetime is not None:
-            # The box has no such value; it counts when orders are not renewed.
-            known |= {Capability.FAIL_SAFE_CURRENT}
-        return known
-
-    @property
-    @override
-    def limits(self) -> Limits:
-        return Limits(installation=self.config.installation_limit)
+    def has_meter(self) -> bool:
+        """Return whether the box is known to measure currents."""
+        return self._info is not None and self._info.meter
 
     @property
     @override
@@ -169,29 +141,29 @@ class AblReader(Charger[AblConfig]):
     @property
     @override
     def exchanges_per_turn(self) -> int:
-        # Identity (info, serial twice), reading, limit, reading twice.
+        # Identity (info, serial twice), status, limit, status twice.
         return 7
 
-    # -- Who it is ---------------------------------------------------------------
+    # -- Identity ----------------------------------------------------------------
 
     @override
     def on_line_open(self) -> None:
-        self.forget()
+        self.invalidate()
 
-    def forget(self) -> None:
-        """Ask anew who it is before anything else is said."""
-        self.raw = None
+    def invalidate(self) -> None:
+        """Drop all state; the identity is checked before the next exchange."""
+        self.last_status = None
         self._identified = False
         self._flags = None
         self._flags_due = 0.0
         self._icmax = None
-        self.tells_icmax = None
+        self.has_icmax = None
         self._energy.interrupt()
 
     @override
     def on_missed(self, now: float) -> None:
         super().on_missed(now)
-        # Whoever answers next may be another one.
+        # The next reply may come from another box.
         self._identified = False
 
     @property
@@ -199,13 +171,13 @@ class AblReader(Charger[AblConfig]):
         """Return the serial number that was read at this address."""
         return self._serial if self._identified else None
 
-    async def identify(self, turn: Turn) -> Info:
-        """Make sure that the right box answers; return what it is.
+    async def identify(self, turn: Turn) -> None:
+        """Check that the right box answers, unless that is known already.
 
         Raises WrongChargerError, and then nothing may be written.
         """
-        if self._identified and self._info is not None:
-            return self._info
+        if self._identified:
+            return
         address = self.config.address
         info = await read(turn, address, INFO)
         serial = await self._read_serial(turn)
@@ -214,20 +186,19 @@ class AblReader(Charger[AblConfig]):
             self.notice(Fault.WRONG_CHARGER, present=True)
             self.set_unavailable()
             found = serial or "no serial number"
-            message = f"at device-ID {address} answers {found}, not {expected}"
+            message = f"found {found} at device-ID {address}, expected {expected}"
             raise WrongChargerError(message, expected=expected, found=found)
         self.notice(Fault.WRONG_CHARGER, present=False)
         self._serial = serial
         self._info = info
         self._identified = True
         self.info = charger_info(info, serial, self._flags)
-        return info
 
     async def _read_serial(self, turn: Turn) -> str | None:
-        """Return the serial number; ``None`` from a box that tells none.
+        """Return the serial number; ``None`` from a box that has none.
 
         The manual shows 0x0050 in an example only. Where no serial number is
-        expected, silence is taken for a register that is not there.
+        expected, silence means that there is no such register.
         """
         try:
             serial = await read(turn, self.config.address, SERIAL, attempts=2)
@@ -239,25 +210,37 @@ class AblReader(Charger[AblConfig]):
             return None
         return serial.number
 
-    # -- What it says ------------------------------------------------------------
+    # -- Status, flags, Icmax ----------------------------------------------------
 
-    async def look(self, turn: Turn) -> Reading:
-        """Read the state anew in the midst of a conversation, and keep it."""
-        raw = await self.read_once(turn, attempts=2)
-        self.take(raw, turn.now)
-        return raw
+    async def poll_status(self, turn: Turn) -> Reading:
+        """Read the status once, and the flags where due; keep and return it.
 
-    async def read_once(self, turn: Turn, *, attempts: int = 1) -> Reading:
-        """Return what 0x002E tells; raises what `Turn.exchange` raises."""
-        return await read(turn, self.config.address, READING, attempts=attempts)
+        The flags are due every `FLAGS_INTERVAL`, and when the status has changed.
+        """
+        status = await read(turn, self.config.address, READING)
+        last = self.last_status
+        if (
+            last is None
+            or (last.state, last.reduced) != (status.state, status.reduced)
+            or turn.now >= self._flags_due
+        ):
+            await self.read_flags(turn)
+        self.keep_status(status, turn.now)
+        return status
 
-    def take(self, raw: Reading, now: float) -> None:
-        """Make a reading of what was told."""
-        self.raw = raw
+    async def read_status(self, turn: Turn) -> Reading:
+        """Read the status in the midst of a conversation, and keep it."""
+        status = await read(turn, self.config.address, READING, attempts=2)
+        self.keep_status(status, turn.now)
+        return status
+
+    def keep_status(self, status: Reading, now: float) -> None:
+        """Keep a status read at a loop time (s), and make the reading of it."""
+        self.last_status = status
         if self._info is None:
             return
         snapshot = Snapshot(
-            reading=raw, info=self._info, flags=self._flags, icmax=self._icmax
+            reading=status, info=self._info, flags=self._flags, icmax=self._icmax
         )
         currents = phase_currents(snapshot, self.config.phase_order)
         power = power_of(currents, self.config.voltage)
@@ -269,21 +252,11 @@ class AblReader(Charger[AblConfig]):
         if changed:
             self.updated()
 
-    async def read_flags_if_due(self, turn: Turn, raw: Reading) -> None:
-        """Read the flags from time to time, and when the state is another one."""
-        known = self.raw
-        if (
-            known is None
-            or (known.state, known.reduced) != (raw.state, raw.reduced)
-            or turn.now >= self._flags_due
-        ):
-            await self.read_flags(turn)
-
     async def read_flags(self, turn: Turn) -> None:
-        """Read the flags; without an answer the old ones count for a while."""
+        """Read flags and Icmax; without a reply the old values count for a while."""
         try:
             self._flags = await read(turn, self.config.address, FLAGS)
-            if self.tells_icmax:
+            if self.has_icmax:
                 icmax = await read(turn, self.config.address, ICMAX)
                 self._icmax = icmax.duty
         except ReplyTimeoutError, ExchangeRefusedError:
@@ -298,47 +271,86 @@ class AblReader(Charger[AblConfig]):
         if self._info is not None:
             self.info = charger_info(self._info, self._serial, self._flags)
 
-    async def look_for_icmax(self, turn: Turn) -> None:
-        """Find out whether the box knows a register that the manual omits."""
-        # Silence is its answer for "no", and no miss.
-        self.tells_icmax = False
+    async def probe_icmax(self, turn: Turn) -> None:
+        """Find out whether the box has register 0x000F, which is not in the manual."""
+        # Silence means no; it is not a missed reply.
+        self.has_icmax = False
         try:
             icmax = await read(turn, self.config.address, ICMAX)
         except ReplyTimeoutError, ExchangeRefusedError:
             return
-        self.tells_icmax = True
+        self.has_icmax = True
         self._icmax = icmax.duty
 
-    # -- What is written -------------------------------------------------------------
+    # -- Writes ------------------------------------------------------------------
 
-    async def enforce(
-        self, turn: Turn, wanted: Callable[[], Setpoint], *, starts: bool = False
-    ) -> None:
-        """Write a set-point until it is read back, at it or below it.
+    async def apply_setpoint(
+        self, turn: Turn, setpoint: Callable[[], Setpoint], *, starts: bool = False
+    ) -> Reading:
+        """Write a set-point until the limit read back is at or below it.
 
-        ``starts``: a pause read back does not count as below. Raises
-        NotConfirmedError when the box does not follow, ExchangeRefusedError when it
-        says so.
+        ``setpoint`` is called for each write: the orders may change between turns.
+        ``starts``: a pause that is read back does not count as below. Returns the
+        status that confirms it.
+
+        Raises NotConfirmedError when the box does not follow, ExchangeRefusedError
+        when it refuses.
         """
-        for attempt in range(WRITES):
+        for attempt in range(LIMIT_WRITES):
             if attempt:
                 self.statistics.reasserted += 1
-            setpoint = wanted()
-            duty = limit_duty(setpoint)
+            limit = setpoint()
+            duty = limit_duty(limit)
             try:
-                await set_limit(turn, self.config.address, setpoint)
+                await turn.exchange(
+                    write_limit(self.config.address, limit),
+                    write_answer(self.config.address, LIMIT_REGISTER),
+                )
             except ExchangeRefusedError:
                 self.notice(Fault.LIMIT_NOT_TAKEN, present=True)
                 raise
             for pause in (SETTLING, None):
-                raw = await self.look(turn)
-                still_paused = starts and raw.duty == PAUSE != duty
-                if is_within(raw.duty, duty) and not still_paused:
+                status = await self.read_status(turn)
+                still_paused = starts and status.duty == PAUSE != duty
+                if is_within(status.duty, duty) and not still_paused:
                     self.confirmed = duty
                     self.notice(Fault.LIMIT_NOT_TAKEN, present=False)
-                    return
+                    return status
                 if pause is not None:
                     await rest(pause)
         self.notice(Fault.LIMIT_NOT_TAKEN, present=True)
         message = f"{self.config.name} does not follow its limit"
         raise NotConfirmedError(message)
+
+    async def set_state(self, turn: Turn, code: StateCode) -> bool:
+        """Write a state code once; return whether the box has confirmed it.
+
+        A reply that stays away decides nothing: the state has to be read.
+        """
+        try:
+            await turn.exchange(
+                write_state(self.config.address, code),
+                write_answer(self.config.address, STATE_REGISTER),
+            )
+        except ReplyTimeoutError:
+            return False
+        return True
+
+    async def set_configuration(
+        self,
+        turn: Turn,
+        device_id: int,
+        *,
+        upstream_timeout: bool | None = None,
+        needs_enable: bool | None = None,
+    ) -> None:
+        """Write device-ID and settings (in E2); ``None``: no change."""
+        request = write_configuration(
+            self.config.address,
+            device_id,
+            upstream_timeout=upstream_timeout,
+            needs_enable=needs_enable,
+        )
+        await turn.exchange(
+            request, write_answer(self.config.address, CONFIGURATION_REGISTER)
+        )

@@ -106,7 +106,7 @@ def charger_reading(
             else state.status
         ),
         raw_state=state.name,
-        plugged=reading.plugged if state.tells_plugged else None,
+        plugged=reading.plugged if state.plugged_valid else None,
         charging=state.charging,
         current=currents,
         estimated_power=power,

@@ -1,4 +1,4 @@
-"""Looking for ABL boxes on a bus: device-IDs 1 to 16, reading only."""
+"""Scan for ABL wallboxes at device-IDs 1 to 16; nothing is written."""
 
 import asyncio
 from collections import deque
@@ -14,7 +14,7 @@ from ..model import ChargerConfig, Orders
 from ..protocol import Progress
 from ..readings import ChargerInfo
 from ..scan import FoundCharger, ScanResult
-from .exchanges import read
+from .reader import read
 from .readings import charger_info
 from .registers import (
     ADDRESSES,
@@ -24,23 +24,23 @@ from .registers import (
     read_request,
 )
 
-ASKED: Final = 2
-"""A box asleep loses the first request, so every ID is asked twice."""
-ASKED_PATIENTLY: Final = 4
-"""On a line where others talk, or where an answer was unreadable."""
-REPEAT_AFTER: Final = 0.6
-"""Pause between two requests to one ID; others are asked meanwhile, s."""
-FEW: Final = 2
-"""More unreadable IDs than these are no collisions, but a line that does not fit."""
+ATTEMPTS: Final = 2
+"""Requests to a silent device-ID: a box asleep loses the first one."""
+NOISY_ATTEMPTS: Final = 4
+"""Requests where a reply was unreadable or the line was busy."""
+REPEAT_PAUSE: Final = 0.6
+"""Pause between two requests to one device-ID, s; others are scanned meanwhile."""
+MOST_DUPLICATES: Final = 2
+"""More unreadable device-IDs than these are no collisions, but wrong line settings."""
 
 
 @dataclass(slots=True)
-class _Asked:
-    """One device-ID, and what came of asking it."""
+class _Candidate:
+    """One device-ID and the outcome of the requests to it."""
 
     address: int
     ready: float = 0.0
-    """Not before this loop time."""
+    """Loop time of the next request, s; not before."""
     silent: int = 0
     garbled: int = 0
     busy: int = 0
@@ -48,41 +48,41 @@ class _Asked:
 
     @property
     def done(self) -> bool:
-        """Return whether nothing more can be learnt."""
-        if self.found is not None or self.silent >= ASKED:
+        """Return whether another request would change nothing."""
+        if self.found is not None or self.silent >= ATTEMPTS:
             return True
-        return self.silent + self.garbled + self.busy >= ASKED_PATIENTLY
+        return self.silent + self.garbled + self.busy >= NOISY_ATTEMPTS
 
 
 @dataclass(slots=True)
 class _Scan:
-    """One look at all IDs."""
+    """One scan of all device-IDs."""
 
     bus: Bus
-    waiting: deque[_Asked] = field(
-        default_factory=lambda: deque(_Asked(address) for address in ADDRESSES)
+    waiting: deque[_Candidate] = field(
+        default_factory=lambda: deque(_Candidate(address) for address in ADDRESSES)
     )
-    asked: list[_Asked] = field(default_factory=list)
+    scanned: list[_Candidate] = field(default_factory=list)
 
     async def run(self, progress: Progress) -> ScanResult:
-        """Ask one ID after the other; those that stay silent again, in their time."""
+        """Send a request to one device-ID after the other, to silent ones again."""
         loop = asyncio.get_running_loop()
         while self.waiting:
-            progress(len(self.asked) / len(ADDRESSES))
+            progress(len(self.scanned) / len(ADDRESSES))
             one = min(self.waiting, key=lambda one: max(one.ready, loop.time()))
             if (pause := one.ready - loop.time()) > 0:
                 await asyncio.sleep(pause)
-            await self._ask(one)
-            one.ready = loop.time() + REPEAT_AFTER
+            await self._scan(one)
+            one.ready = loop.time() + REPEAT_PAUSE
             if one.done:
                 self.waiting.remove(one)
-                self.asked.append(one)
+                self.scanned.append(one)
         progress(1.0)
-        return self._report()
+        return self._result()
 
-    async def _ask(self, one: _Asked) -> None:
+    async def _scan(self, one: _Candidate) -> None:
         try:
-            info = await self.bus.run(partial(_ask_info, one.address))
+            info = await self.bus.run(partial(_read_info, one.address))
             one.found = FoundCharger(address=one.address, info=info, serial=info.serial)
         except GarbledReplyError:
             one.garbled += 1
@@ -91,39 +91,39 @@ class _Scan:
         except LineBusyError:
             one.busy += 1
 
-    def _report(self) -> ScanResult:
-        """Return what was found, addresses in order."""
-        self.asked.sort(key=lambda one: one.address)
-        found = tuple(one.found for one in self.asked if one.found is not None)
+    def _result(self) -> ScanResult:
+        self.scanned.sort(key=lambda one: one.address)
+        found = tuple(one.found for one in self.scanned if one.found is not None)
         garbled = tuple(
             one.address
-            for one in self.asked
-            if one.found is None and one.garbled >= ASKED
+            for one in self.scanned
+            if one.found is None and one.garbled >= ATTEMPTS
         )
-        if not found and len(garbled) > FEW:
+        if not found and len(garbled) > MOST_DUPLICATES:
             return ScanResult(unreadable=True)
         return ScanResult(found=found, duplicates=garbled)
 
 
-async def _ask_info(address: int, turn: Turn) -> ChargerInfo:
-    """Return what a box at this address is.
+async def _read_info(address: int, turn: Turn) -> ChargerInfo:
+    """Return identity and options of the box at a device-ID.
 
-    Two equal boxes may answer this as one; their serial numbers differ, so that
-    answer is then unreadable, or there are two. Raises GarbledReplyError for both.
+    The replies of two equal boxes may collide and look like one. Their serial numbers
+    differ: that reply is then unreadable, or there are two. Raises GarbledReplyError
+    in both cases.
     """
     info = await read(turn, address, INFO)
-    serials = await _listen_for_serials(turn, address)
+    serials = await _read_serials(turn, address)
     if len(serials) > 1:
         message = f"device-ID {address} has {len(serials)} serial numbers"
         raise GarbledReplyError(message)
     return charger_info(info, serials.pop() if serials else None, None)
 
 
-async def _listen_for_serials(turn: Turn, address: int) -> set[str | None]:
-    """Return every serial number told at an address; none: it has no such register.
+async def _read_serials(turn: Turn, address: int) -> set[str | None]:
+    """Return all serial numbers at a device-ID; none where the register is missing.
 
-    Nothing is taken for the answer, so that a second box which is a little slower
-    than the first one is heard as well.
+    No reply ends the exchange, so that the reply of a second, slightly slower box is
+    collected as well.
     """
     serials: set[str | None] = set()
     answer = read_answer(address, SERIAL.block)
@@ -133,7 +133,7 @@ async def _listen_for_serials(turn: Turn, address: int) -> set[str | None]:
             serials.add(SERIAL.decode(data).number)
 
     garbled: GarbledReplyError | None = None
-    for _ in range(ASKED):
+    for _ in range(ATTEMPTS):
         try:
             await turn.exchange(read_request(address, SERIAL.block), collect)
         except GarbledReplyError as error:
@@ -150,10 +150,9 @@ async def _listen_for_serials(turn: Turn, address: int) -> set[str | None]:
 async def scan(
     bus: Bus, config: ChargerConfig, orders: Orders, progress: Progress
 ) -> ScanResult:
-    """Look for boxes at all device-IDs; nothing is written.
+    """Scan all device-IDs; reading needs neither ``config`` nor ``orders``.
 
-    ``config`` and ``orders`` are not needed: every box can be read without setting
-    anything. Raises LineLostError when the port is lost meanwhile.
+    Raises LineLostError when the port is lost meanwhile.
     """
     del config, orders
     return await _Scan(bus).run(progress)

@@ -1,9 +1,9 @@
-"""The state byte of an EVCC2/3, and what can be said from it.
+"""The states of an EVCC2/3 and their meaning.
 
-Source: ABL EVCC2/3 manual, annex 3.4. The byte reads as the state's name in hex:
-0xA1 is A1, 0xF9 is F9, 0xFB is F11. F14 to F17 are only mentioned (register 0x0006
-bit 15, C3, C4): F14 and F15 are taken as 0xFE and 0xFF; F16 and F17 do not fit a
-byte and show as C3. F12 and F13 do not exist.
+Source: ABL EVCC2/3 manual, annex 3.4. The state byte in hex is the state's name: 0xA1
+is A1, 0xF9 is F9, 0xFB is F11. F14 to F17 are only mentioned (register 0x0006 bit 15,
+C3, C4): F14 and F15 are taken as 0xFE and 0xFF; F16 and F17 do not fit a byte and
+show as C3. F12 and F13 do not exist.
 """
 
 from collections.abc import Mapping
@@ -26,15 +26,15 @@ E3: Final = 0xE3
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """What a state says by itself; ``None``: not told."""
+    """What follows from a state alone; ``None``: unknown."""
 
     name: str
-    """As the manual writes it; an unknown one as its byte in hex."""
+    """As in the manual; of an unknown state its byte in hex."""
     status: Status | None = None
     charging: bool | None = None
     outlet_enabled: bool | None = None
-    tells_plugged: bool = False
-    """Bit 63 of register 0x002E counts (not in Ex and Fx)."""
+    plugged_valid: bool = False
+    """Bit 63 of register 0x002E is valid (not in Ex and Fx)."""
     no_current: bool = False
     """The contactor is open: no current can flow (PROTOCOLS.md, 2)."""
     fault: Fault | None = None
@@ -46,7 +46,7 @@ def _waiting(name: str, status: Status) -> State:
         status=status,
         charging=False,
         outlet_enabled=True,
-        tells_plugged=True,
+        plugged_valid=True,
         no_current=True,
     )
 
@@ -57,7 +57,7 @@ def _charging(name: str, fault: Fault | None = None) -> State:
         status=Status.CHARGING,
         charging=True,
         outlet_enabled=True,
-        tells_plugged=True,
+        plugged_valid=True,
         fault=fault,
     )
 
@@ -68,14 +68,14 @@ def _failure(name: str, fault: Fault) -> State:
 
 STATES: Final[Mapping[int, State]] = {
     A1: _waiting("A1", Status.AVAILABLE),
-    # The car asks and is not permitted yet.
+    # The car requests power and has no permission yet.
     B1: _waiting("B1", Status.PREPARING),
-    # The car has the permission and takes nothing; also for the moment between
-    # plugging in and its first current, which the box does not tell apart.
+    # The car has the permission and draws nothing. The moment between plugging in
+    # and the first current looks the same.
     B2: _waiting("B2", Status.SUSPENDED_EV),
     C2: _charging("C2"),
-    # An example in 1.3 has C3 for "C2, I > 1 A": whether the current is reduced is
-    # for bit 62 to say.
+    # An example in 1.3 has C3 for "C2, I > 1 A": bit 62 shows whether the current is
+    # reduced.
     C3: _charging("C3"),
     C4: _charging("C4", Fault.LOAD_IMBALANCE),
     E0: State(
@@ -104,15 +104,14 @@ STATES: Final[Mapping[int, State]] = {
 }
 
 SETUP: Final = frozenset({E1, E2, E3})
-"""Production test, setup, idle bus: no limit is written there."""
-CHARGING: Final = frozenset({C2, C3, C4})
+"""Production test, set-up, idle bus: no limit is written in these."""
 
 _FAILURES: Final = 0xF0
 _OUT_OF_ORDER: Final = 0xE0
 
 
 def state_of(code: int) -> State:
-    """Return what a state byte says; an unknown one keeps its raw value."""
+    """Return the state of a state byte; an unknown one is named by its value."""
     if (known := STATES.get(code)) is not None:
         return known
     name = f"0x{code:02X}"

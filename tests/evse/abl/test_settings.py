@@ -1,4 +1,4 @@
-"""Setting a box up: only where it is certain which box, and that it lasts."""
+"""Settings of the box: written to an identified box only, and checked afterwards."""
 
 import asyncio
 
@@ -57,9 +57,9 @@ async def test_a_new_device_id_in_e0_leaves_the_outlet_disabled() -> None:
         assert (box.device_id, box.state) == (2, "E0")
 
 
-async def test_a_device_id_that_is_taken() -> None:
-    stranger = AblBox(3, serial="2W22xy00000003", sleep_after=5, wake_time=0.1)
-    async with Scene(box_with(), AblBox(2, serial="2W22xy00000002"), stranger) as scene:
+async def test_a_device_id_in_use() -> None:
+    unknown = AblBox(3, serial="2W22xy00000003", sleep_after=5, wake_time=0.1)
+    async with Scene(box_with(), AblBox(2, serial="2W22xy00000002"), unknown) as scene:
         charger = await scene.settled(config(), orders())
         scene.add(config(2), orders())
         for address in (2, 3):
@@ -70,7 +70,7 @@ async def test_a_device_id_that_is_taken() -> None:
 
 
 @pytest.mark.parametrize("value", [0, 17, True, None, 2.0])
-async def test_no_device_id(value: object) -> None:
+async def test_an_invalid_device_id_is_refused(value: object) -> None:
     async with Scene(box_with()) as scene:
         charger = await scene.settled(config(), orders())
         with pytest.raises(RefusedOrderError):
@@ -79,7 +79,7 @@ async def test_no_device_id(value: object) -> None:
         assert scene.writes() == []
 
 
-async def test_no_set_up_with_a_car_or_without_a_serial_number() -> None:
+async def test_no_settings_with_a_car_or_without_a_serial_number() -> None:
     car = sleepy()
     box = box_with(car)
     async with Scene(box) as scene:
@@ -96,12 +96,12 @@ async def test_no_set_up_with_a_car_or_without_a_serial_number() -> None:
         assert scene.writes() == []
 
 
-async def test_a_refused_set_up_leaves_the_set_up_mode() -> None:
+async def test_refused_settings_leave_the_set_up_mode() -> None:
     box = box_with()
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders())
-        await scene.quiet(charger)
-        # The look before, E2, the state, and the set-up.
+        await scene.stop_polls(charger)
+        # The status, E2, the status again, and the settings.
         answers(box, "good", "good", "good", b">0190046B\r\n")
         with pytest.raises(EvseError, match="exception 4"):
             await charger.command(Command.SET_UPSTREAM_TIMEOUT, value=True)
@@ -134,18 +134,18 @@ async def test_enable_after_power_cycle(on: bool) -> None:  # noqa: FBT001
         assert charger.info.options["enable_after_power_cycle"] is on
 
 
-async def test_a_setting_that_does_not_last() -> None:
+async def test_a_setting_that_is_not_taken() -> None:
     box = box_with()
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders())
-        # Somebody else's set-up goes into the box in place of ours.
+        # The box confirms the write and ignores it.
         box._configure = lambda _value: True  # type: ignore[method-assign]
         with pytest.raises(NotConfirmedError, match="upstream_timeout"):
             await charger.command(Command.SET_UPSTREAM_TIMEOUT, value=True)
         assert box.state == "A1"
 
 
-async def test_nothing_is_ever_said_to_all() -> None:
+async def test_nothing_is_broadcast() -> None:
     box = box_with()
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders())
@@ -167,5 +167,5 @@ async def test_a_port_lost_in_the_set_up_mode() -> None:
             await setting
         scene.virtual.replug()
         await until(lambda: box.state == "A1")
-        await until(lambda: charger.owes is None)
+        await until(lambda: charger.pending_cleanup is None)
         assert charger.config.address == box.device_id

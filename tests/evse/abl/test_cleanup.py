@@ -1,4 +1,4 @@
-"""What a command leaves half done, when the port is lost or the user says more."""
+"""Cleanup after a command: cut off by a lost port, or overtaken by another command."""
 
 import asyncio
 
@@ -17,7 +17,7 @@ PAUSE = 1000
 pytestmark = pytest.mark.usefixtures("short_pauses")
 
 
-async def cut_off_while_waking(scene: Scene, box: AblBox) -> AblCharger:
+async def cut_off_wake(scene: Scene, box: AblBox) -> AblCharger:
     """Lose the port while a car is woken: the outlet is still disabled."""
     charger = await scene.settled(config(), orders())
     await until(lambda: box.state == "B2")
@@ -30,14 +30,16 @@ async def cut_off_while_waking(scene: Scene, box: AblBox) -> AblCharger:
     return charger
 
 
-async def test_a_pause_said_meanwhile_stands_before_the_outlet_is_enabled() -> None:
+async def test_a_pause_ordered_meanwhile_is_written_before_the_outlet_is_enabled() -> (
+    None
+):
     box = box_with(sleepy())
     async with Scene(box) as scene:
-        charger = await cut_off_while_waking(scene, box)
+        charger = await cut_off_wake(scene, box)
         with pytest.raises(EvseError):
             await charger.change_orders(OrderChange(allowed=False))
         scene.virtual.replug()
-        await until(lambda: charger.owes is None)
+        await until(lambda: charger.pending_cleanup is None)
         await scene.polled(charger)
         assert scene.writes() == [E0, PAUSE, A1]
         assert box.state != "E0"
@@ -46,13 +48,13 @@ async def test_a_pause_said_meanwhile_stands_before_the_outlet_is_enabled() -> N
 async def test_an_outlet_disabled_by_the_user_meanwhile_stays_so() -> None:
     box = box_with(sleepy())
     async with Scene(box) as scene:
-        charger = await cut_off_while_waking(scene, box)
+        charger = await cut_off_wake(scene, box)
         disabling = asyncio.Event()
 
         def disable() -> None:
             if scene.bus.connected and not disabling.is_set():
                 disabling.set()
-                # Let the command come before the first reading.
+                # The command must come before the first poll.
                 charger.slot.ready += 0.3
                 tasks.append(
                     asyncio.create_task(
@@ -88,7 +90,7 @@ async def reset_when_disabled(
     ("command", "value"),
     [(Command.RESET, None), (Command.SET_UPSTREAM_TIMEOUT, True)],
 )
-async def test_an_outlet_is_disabled_again_though_the_reset_was_cut_off(
+async def test_an_outlet_is_disabled_again_after_a_reset_that_was_cut_off(
     command: Command,
     value: bool | None,  # noqa: FBT001
 ) -> None:
@@ -97,11 +99,11 @@ async def test_an_outlet_is_disabled_again_though_the_reset_was_cut_off(
         charger = await scene.settled(config(), orders(10, allowed=False))
         await reset_when_disabled(scene, box, charger, command, value)
         await until(lambda: box.state == "E0")
-        await until(lambda: charger.owes is None)
+        await until(lambda: charger.pending_cleanup is None)
         await until(lambda: box.ic_amps == 0)
 
 
-async def test_after_a_reset_the_car_that_was_stopped_is_stopped_again() -> None:
+async def test_a_reset_starts_no_car_at_a_disabled_outlet() -> None:
     car = Car(ramp=0.0, reaction=0.0)
     car.plug_in()
     box = box_with(car)
@@ -112,7 +114,9 @@ async def test_after_a_reset_the_car_that_was_stopped_is_stopped_again() -> None
         assert scene.writes(STATE) == [E0, RESET, E0]
 
 
-async def test_a_limit_not_taken_after_a_reset_leaves_no_outlet_enabled() -> None:
+async def test_an_outlet_is_disabled_again_though_the_limit_is_refused_after_a_reset() -> (
+    None
+):
     box = box_with()
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders(10))
@@ -135,13 +139,13 @@ async def test_an_outlet_enabled_by_the_user_after_a_reset_stays_so() -> None:
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders(10))
         await reset_when_disabled(scene, box, charger, Command.RESET, None)
-        await until(lambda: charger.owes is None and charger.available)
+        await until(lambda: charger.pending_cleanup is None and charger.available)
         await charger.command(Command.SET_OUTLET, value=True)
         await scene.polled(charger, 5)
         assert box.state == "A1"
 
 
-async def test_a_box_that_stays_in_its_set_up_mode_is_led_out_of_it() -> None:
+async def test_a_box_that_stays_in_set_up_mode_is_led_out_of_it() -> None:
     box = box_with()
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders(10))

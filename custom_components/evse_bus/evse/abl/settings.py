@@ -1,0 +1,165 @@
+"""The box's own settings: device-ID, upstream time-out, enable after a power cycle.
+
+Register 0x002C accepts them in state E2; they count after a reset and survive power
+cycles. The box must have been identified by its serial number (PROTOCOLS.md, 2).
+"""
+
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+
+from ..conversation import rest
+from ..errors import (
+    DuplicateAddressError,
+    EvseError,
+    NotAvailableError,
+    NotConfirmedError,
+    ReplyTimeoutError,
+)
+from ..exchange import Turn
+from .reader import AblReader, Cleanup, read
+from .registers import INFO, SERIAL, Reading, StateCode
+from .states import A1, E0, E2
+from .steps import (
+    BOOT_ATTEMPTS,
+    hold_polls,
+    reach,
+    reach_state,
+    recover,
+    refuse_in,
+    rest_without_polls,
+    restore,
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """A change of register 0x002C; ``None``: no change."""
+
+    device_id: int | None = None
+    """1 to 16."""
+    upstream_timeout: bool | None = None
+    needs_enable: bool | None = None
+    """A plugged car must be enabled anew after a power cycle."""
+
+
+async def change_settings(reader: AblReader, settings: Settings, turn: Turn) -> None:
+    """Write settings in E2, reset the box, and check that it has taken them.
+
+    Raises NotAvailableError in a state without E2 and without a serial number,
+    DuplicateAddressError for a device-ID in use, NotConfirmedError.
+    """
+    before = await reach(reader, turn)
+    old = reader.config.address
+    new = old if settings.device_id is None else settings.device_id
+    if settings.device_id == old:
+        return
+    serial = _check_ready(reader, before)
+    if new != old and not await _is_free(reader, turn, new):
+        message = f"device-ID {new} is in use"
+        raise DuplicateAddressError(message)
+    was_disabled = before.state == E0
+    reader.pending_cleanup = (
+        Cleanup(StateCode.E0) if was_disabled else Cleanup(StateCode.A1, E2)
+    )
+    try:
+        await _write(reader, turn, settings, new)
+    except EvseError:
+        # Leave E2 after any error.
+        with suppress(EvseError):
+            await restore(reader, turn)
+        raise
+    if new != old:
+        await _follow(reader, turn, new, serial)
+    await recover(reader, turn, was_disabled=was_disabled)
+    await reader.read_flags(turn)
+    _check_taken(reader, settings)
+
+
+def _check_ready(reader: AblReader, status: Reading) -> str:
+    """Return the serial number of a box whose settings can be changed now.
+
+    Raises NotAvailableError.
+    """
+    if status.state not in (A1, E0):
+        raise refuse_in(reader, status, "settings are changed in A1 or E0")
+    if reader.serial is None:
+        message = (
+            f"{reader.config.name} has no serial number: it cannot be distinguished "
+            "from another box with the same device-ID"
+        )
+        raise NotAvailableError(message)
+    return reader.serial
+
+
+async def _is_free(reader: AblReader, turn: Turn, address: int) -> bool:
+    """Return whether a device-ID is not configured for another box, and silent."""
+    others = reader.bus.chargers.values() if reader.bus is not None else ()
+    if any(other.config.address == address for other in others):
+        return False
+    with suppress(ReplyTimeoutError):
+        await read(turn, address, INFO)
+        return False
+    # A sleeping box loses the first request.
+    await rest(reader.pauses.retry)
+    with suppress(ReplyTimeoutError):
+        await read(turn, address, INFO)
+        return False
+    return True
+
+
+async def _write(
+    reader: AblReader, turn: Turn, settings: Settings, device_id: int
+) -> None:
+    """Go to E2, write the settings, and reset the box."""
+    hold_polls(reader, turn)
+    await reach_state(reader, turn, StateCode.E2, lambda now: now.state == E2)
+    await rest_without_polls(reader, turn, reader.pauses.settings)
+    write = partial(
+        reader.set_configuration,
+        turn,
+        device_id,
+        upstream_timeout=settings.upstream_timeout,
+        needs_enable=settings.needs_enable,
+    )
+    try:
+        await write()
+    except ReplyTimeoutError:
+        # Not readable before the reset; to write the same value again is harmless.
+        await write()
+    await rest_without_polls(reader, turn, reader.pauses.settings)
+    if not await reader.set_state(turn, StateCode.RESET):
+        with suppress(ReplyTimeoutError):
+            if (await reader.read_status(turn)).state == E2:
+                await reader.set_state(turn, StateCode.RESET)
+
+
+async def _follow(reader: AblReader, turn: Turn, address: int, serial: str) -> None:
+    """Wait for the box at its new device-ID, known by its serial number."""
+    reader.invalidate()
+    for _ in range(BOOT_ATTEMPTS):
+        await rest_without_polls(reader, turn, reader.pauses.boot)
+        with suppress(ReplyTimeoutError):
+            found = await read(turn, address, SERIAL)
+            if found.number == serial:
+                reader.move(address)
+                return
+    message = (
+        f"{reader.config.name} was not found at device-ID {address}; "
+        f"it is still expected at {reader.config.address}"
+    )
+    raise NotConfirmedError(message)
+
+
+def _check_taken(reader: AblReader, settings: Settings) -> None:
+    """Raise NotConfirmedError when a setting has not been taken."""
+    options = reader.info.options if reader.info is not None else {}
+    enable = None if settings.needs_enable is None else not settings.needs_enable
+    wanted = {
+        "upstream_timeout": settings.upstream_timeout,
+        "enable_after_power_cycle": enable,
+    }
+    for name, value in wanted.items():
+        if value is not None and options.get(name) is not value:
+            message = f"{reader.config.name} did not take {name} = {value}"
+            raise NotConfirmedError(message)

@@ -1,0 +1,148 @@
+"""Steps that the commands of an ABL wallbox have in common.
+
+A write to register 0x0005 whose reply is lost is never simply repeated: the state is
+read first, and decides.
+"""
+
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Final
+
+from ..conversation import rest
+from ..errors import (
+    ExchangeError,
+    NotAvailableError,
+    NotConfirmedError,
+    ReplyTimeoutError,
+)
+from ..exchange import Turn
+from .duty import is_within
+from .reader import AblReader
+from .registers import Reading, StateCode, limit_duty
+from .states import E0, E2, state_of
+
+REACH_ATTEMPTS: Final = 3
+"""Attempts to reach a box that may be asleep."""
+BOOT_ATTEMPTS: Final = 10
+"""Attempts to reach a box after a reset."""
+STATE_READS: Final = 4
+"""Reads of a state before it counts as not reached."""
+
+
+async def reach(reader: AblReader, turn: Turn) -> Reading:
+    """Wake the box and return its status; repeats are safe: nothing is written yet."""
+    for _ in range(REACH_ATTEMPTS - 1):
+        with suppress(ReplyTimeoutError):
+            return await _contact(reader, turn)
+        await rest(reader.pauses.retry)
+    return await _contact(reader, turn)
+
+
+async def _contact(reader: AblReader, turn: Turn) -> Reading:
+    await reader.identify(turn)
+    return await reader.read_status(turn)
+
+
+def hold_polls(reader: AblReader, turn: Turn) -> None:
+    """Postpone the next poll: the box restarts or is being set up."""
+    slot = reader.slot
+    slot.ready = max(slot.ready, turn.now + 2 * reader.pauses.boot)
+
+
+async def rest_without_polls(reader: AblReader, turn: Turn, pause: float) -> None:
+    """Rest for a time, s, in which the box is not polled."""
+    hold_polls(reader, turn)
+    await rest(pause)
+    hold_polls(reader, turn)
+
+
+def refuse_in(reader: AblReader, status: Reading, reason: str) -> NotAvailableError:
+    """Return the error for a command that is not possible in a state."""
+    state = state_of(status.state).name
+    return NotAvailableError(f"{reader.config.name} is in state {state}: {reason}")
+
+
+async def reach_state(
+    reader: AblReader, turn: Turn, code: StateCode, reached: Callable[[Reading], bool]
+) -> Reading:
+    """Write a state code; return the status that shows its effect.
+
+    Written again only while the state is not reached and no reply has come. Raises
+    NotConfirmedError, and ExchangeRefusedError.
+    """
+    confirmed = await reader.set_state(turn, code)
+    for _ in range(STATE_READS):
+        if reached(status := await reader.read_status(turn)):
+            return status
+        if not confirmed:
+            confirmed = await reader.set_state(turn, code)
+        await rest(reader.pauses.verify)
+    if reached(status := await reader.read_status(turn)):
+        return status
+    message = f"{reader.config.name} does not change to {code.name}"
+    raise NotConfirmedError(message)
+
+
+async def recover(reader: AblReader, turn: Turn, *, was_disabled: bool) -> Reading:
+    """Wait for a box after a reset, bring back limit and E0, and return its status.
+
+    A reset ends in A1 with Idefault: neither the limit nor E0 has survived it.
+    """
+    status = await _wait_for_boot(reader, turn)
+    status = await lower_limit(reader, turn, status)
+    if was_disabled:
+        return await disable(reader, turn, status)
+    if status.state != E2:
+        reader.pending_cleanup = None
+    return status
+
+
+async def _wait_for_boot(reader: AblReader, turn: Turn) -> Reading:
+    reader.invalidate()
+    for _ in range(BOOT_ATTEMPTS - 1):
+        await rest_without_polls(reader, turn, reader.pauses.boot)
+        with suppress(ReplyTimeoutError):
+            return await _contact(reader, turn)
+    await rest_without_polls(reader, turn, reader.pauses.boot)
+    return await _contact(reader, turn)
+
+
+async def lower_limit(reader: AblReader, turn: Turn, status: Reading) -> Reading:
+    """Lower the limit to the set-point before a car can start; return the status."""
+    if is_within(status.duty, limit_duty(reader.setpoint)):
+        return status
+    return await reader.apply_setpoint(turn, lambda: reader.setpoint)
+
+
+async def disable(reader: AblReader, turn: Turn, status: Reading) -> Reading:
+    """Disable the outlet, which ends any cleanup; return the status."""
+    if status.state != E0:
+        status = await reach_state(
+            reader, turn, StateCode.E0, lambda now: now.state == E0
+        )
+    reader.pending_cleanup = None
+    return status
+
+
+async def restore(reader: AblReader, turn: Turn) -> None:
+    """Carry out the pending cleanup, if there is one; repeat a lost exchange.
+
+    Raises NotConfirmedError.
+    """
+    cleanup = reader.pending_cleanup
+    if cleanup is None:
+        return
+    for _ in range(STATE_READS):
+        with suppress(ExchangeError):
+            status = await reader.read_status(turn)
+            if cleanup.is_needed(status.state):
+                if status.state == E0:
+                    await lower_limit(reader, turn, status)
+                await reader.set_state(turn, cleanup.code)
+                status = await reader.read_status(turn)
+            if not cleanup.is_needed(status.state):
+                reader.pending_cleanup = None
+                return
+        await rest(reader.pauses.verify)
+    message = f"{reader.config.name} does not leave its state"
+    raise NotConfirmedError(message)
