@@ -29,7 +29,7 @@ pytestmark = pytest.mark.usefixtures("socket_enabled")
 
 ADAPTERS = "homeassistant.components.network.util.ifaddr.get_adapters"
 SOURCE = "homeassistant.components.network.async_get_source_ip"
-OFFERED = "custom_components.evse_bus.flows.listener._OFFERED"
+OFFERED = "custom_components.evse_bus.flows.listener._SUGGESTED"
 NOT_OURS = "192.0.2.9"
 
 

@@ -13,9 +13,8 @@ from pytest_homeassistant_custom_component.common import MockConfigEntry
 
 from custom_components.evse_bus.config_flow import EvseBusConfigFlow
 from custom_components.evse_bus.const import DOMAIN
-from custom_components.evse_bus.evse.protocols import PROTOCOLS
+from custom_components.evse_bus.evse.protocols import PROTOCOLS, protocols_by_make
 from custom_components.evse_bus.flows.listener import ListenerOptionsFlow
-from custom_components.evse_bus.flows.schema import MAKES
 from custom_components.evse_bus.flows.subentry import ChargerSubentryFlow
 from tests.flow import IMPOSED, NOWHERE, charger, english, port_step
 from tests.virtual import (
@@ -153,19 +152,22 @@ async def test_another_network_port_is_another_bus(hass: HomeAssistant) -> None:
 
 
 def test_every_text_belongs_to_a_step() -> None:
-    for texts, flow in (
-        (english()["config"], EvseBusConfigFlow),
-        (english()["config_subentries"]["charger"], ChargerSubentryFlow),
-        (english()["options"], ListenerOptionsFlow),
+    confirm = {f"confirm_{key}" for key in PROTOCOLS}
+    menus = {one.make.menu for one in PROTOCOLS.values()} - {""}
+    for texts, flow, own in (
+        (english()["config"], EvseBusConfigFlow, confirm | menus),
+        (english()["config_subentries"]["charger"], ChargerSubentryFlow, confirm),
+        (english()["options"], ListenerOptionsFlow, set()),
     ):
-        for step in texts["step"]:
+        assert own <= texts["step"].keys()
+        for step in texts["step"].keys() - own:
             assert hasattr(flow, f"async_step_{step}")
 
 
 def test_protocols_say_how_they_use_the_line() -> None:
     labels = english()["selector"]["protocol"]["options"]
-    assert labels.keys() == MAKES.keys()
-    for make, protocols in MAKES.items():
-        for key in protocols:
-            assert str(PROTOCOLS[key].settings) in labels[make]
-    assert sorted(PROTOCOLS) == sorted(key for keys in MAKES.values() for key in keys)
+    makes = protocols_by_make()
+    assert labels.keys() == makes.keys()
+    for make, protocols in makes.items():
+        for protocol in protocols:
+            assert str(protocol.settings) in labels[make]

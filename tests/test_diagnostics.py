@@ -16,7 +16,6 @@ from custom_components.evse_bus.diagnostics import (
     async_get_device_diagnostics,
 )
 from custom_components.evse_bus.evse.protocols import PROTOCOLS
-from custom_components.evse_bus.redaction import on_wire, without_serial
 from tests.common import call, get_entity, running, wait_for_state, wait_until
 from tests.virtual import AblBox, EvboxChargePoint, SmartEvse
 
@@ -171,7 +170,7 @@ async def test_of_one_device(hass: HomeAssistant) -> None:
     ],
 )
 def test_serial_numbers_in_frames(protocol: str, data: bytes, shown: bytes) -> None:
-    assert without_serial(protocol, data) == shown
+    assert PROTOCOLS[protocol].serials.hide(data) == shown
 
 
 @pytest.mark.parametrize(
@@ -188,18 +187,20 @@ def test_serial_numbers_in_frames(protocol: str, data: bytes, shown: bytes) -> N
     ],
 )
 def test_serial_numbers_in_pieces(protocol: str, data: bytes, shown: bytes) -> None:
-    serials = {"evbox": b"01923054", "abl": b"32573232", "smartevse": b"zi"}
-    assert without_serial(protocol, data, [serials[protocol]], whole=False) == shown
+    known = {"evbox": b"01923054", "abl": b"32573232", "smartevse": b"zi"}
+    serials = PROTOCOLS[protocol].serials
+    assert serials.hide(data, [known[protocol]], whole=False) == shown
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_serial_numbers_that_are_none(protocol: str) -> None:
-    assert on_wire(protocol, [None, ""]) == []
+    assert PROTOCOLS[protocol].serials.encoded([None, ""]) == []
 
 
 @pytest.mark.parametrize("serial", ["0", "65536", "x", "-1", "1.5"])
 def test_what_is_no_register_is_no_serial_number(serial: str) -> None:
-    assert on_wire("smartevse", [serial, "31337"]) == [b"zi"]
+    serials = PROTOCOLS["smartevse"].serials
+    assert serials.encoded([serial, "31337"]) == [b"zi"]
 
 
 @pytest.mark.parametrize("protocol", ["abl", "evbox"])

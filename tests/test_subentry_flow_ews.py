@@ -170,7 +170,7 @@ async def test_one_box_on_a_serial_line(hass: HomeAssistant) -> None:
     async with running(hass, EwsBox(serial=SERIAL)) as (entry, _):
         flow = await Flow.add_charger(hass, entry)
         assert flow.result["type"] is FlowResultType.ABORT
-        assert flow.result["reason"] == "one_ews_box"
+        assert flow.result["reason"] == "one_ews"
 
 
 async def test_serial_line_without_a_box_is_searched(hass: HomeAssistant) -> None:

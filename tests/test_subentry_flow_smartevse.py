@@ -172,7 +172,7 @@ async def test_no_second_box_on_a_bus_that_polls(hass: HomeAssistant) -> None:
     )
     flow = await Flow.add_charger(hass, entry)
     assert flow.result["type"] is FlowResultType.ABORT
-    assert flow.result["reason"] == "one_box"
+    assert flow.result["reason"] == "one_smartevse"
 
     # Its place is free again when it was removed.
     hass.config_entries.async_remove_subentry(entry, get(entry, "Box").subentry_id)
@@ -197,7 +197,7 @@ async def test_two_dialogues_add_one_box_to_a_bus_that_polls(
     for flow in dialogues:
         await flow.submit()
     assert dialogues[0].result["type"] is FlowResultType.CREATE_ENTRY
-    assert dialogues[1].result["reason"] == "one_box"
+    assert dialogues[1].result["reason"] == "one_smartevse"
     assert [one.title for one in entry.subentries.values()] == ["Box 0"]
 
 

@@ -1,6 +1,7 @@
 """Config flow of a bus: protocol, port, search, chargers; reconfiguration."""
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, Final, override
 
 from homeassistant.config_entries import (
@@ -16,7 +17,6 @@ from homeassistant.data_entry_flow import AbortFlow
 
 from .configuration import line_settings, protocol_of
 from .const import (
-    CONF_COMMAND,
     CONF_FAIL_SAFE_CURRENT,
     CONF_FAIL_SAFE_TIMEOUT,
     CONF_INSTALLATION_LIMIT,
@@ -28,10 +28,10 @@ from .const import (
 from .coordinator import EvseBusConfigEntry
 from .evse.errors import RefusedOrderError
 from .evse.protocol import Progress, Protocol
-from .evse.protocols import PROTOCOLS
+from .evse.protocols import protocols_by_make
 from .evse.scan import ScanResult
-from .flows.address import ADDRESSES, Errors, typed_addresses
-from .flows.charger import CONF_EXPERT, short_name
+from .flows.address import Errors, typed_addresses
+from .flows.charger import CONF_EXPERT
 from .flows.listener import ListenerOptionsFlow, ListenerSteps
 from .flows.schema import (
     SUGGESTED_LIMIT,
@@ -43,19 +43,17 @@ from .flows.schema import (
     protocol_form,
 )
 from .flows.search import (
-    Imposed,
+    Probe,
     async_search,
     async_try_port,
-    imposed,
     is_same_port,
-    nothing_imposed,
     port_name,
+    probes,
+    read_only_probe,
 )
 from .flows.subentry import ChargerSubentryFlow
 from .flows.supply import check_supply, supply_data, supply_form
 
-_INTERFACES: Final = {"ews": "RS-232"}
-"""Interface of the adapter, where it is not RS-485."""
 _URL_EXAMPLES: Final = "`socket://192.0.2.5:4001`, `rfc2217://192.0.2.5:2217`"
 """Not translated: URLs are the same in every language."""
 
@@ -66,13 +64,15 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
     VERSION = 1
     MINOR_VERSION = 1
 
-    at_once = True
+    adds_several = True
     step_after_error = "port"
 
     def __init__(self) -> None:
         """Start without a search."""
         super().__init__()
-        self._searches: list[Imposed] = []
+        self._protocols: list[Protocol] = []
+        """Protocols of the chosen make."""
+        self._searches: list[Probe] = []
 
     @classmethod
     @callback
@@ -110,53 +110,35 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
     ) -> ConfigFlowResult:
         """Choose the make of the chargers."""
         if user_input is not None:
-            make = user_input[CONF_PROTOCOL]
-            if make == "smartevse":
-                return await self.async_step_mode()
-            if make == "ews":
-                return await self.async_step_connection()
-            self.protocol = PROTOCOLS[make]
-            return await self.async_step_port()
+            self._protocols = protocols_by_make()[user_input[CONF_PROTOCOL]]
+            if len(self._protocols) == 1:
+                return await self._async_use(self._protocols[0])
+            return await self._async_choose_protocol()
         return self.async_show_form(step_id="user", data_schema=protocol_form())
 
-    async def async_step_mode(
+    async def _async_choose_protocol(
         self,
         user_input: dict[str, Any] | None = None,  # noqa: ARG002 - a step's signature
     ) -> ConfigFlowResult:
-        """Choose whether Home Assistant polls a SmartEVSE or is its master."""
-        return self.async_show_menu(step_id="mode", menu_options=["polled", "master"])
-
-    async def async_step_polled(
-        self,
-        user_input: dict[str, Any] | None = None,  # noqa: ARG002
-    ) -> ConfigFlowResult:
-        """Set up one polled SmartEVSE."""
-        self.protocol = PROTOCOLS["smartevse"]
-        return await self.async_step_port()
-
-    async def async_step_master(
-        self,
-        user_input: dict[str, Any] | None = None,  # noqa: ARG002
-    ) -> ConfigFlowResult:
-        """Set up the load-balancing master of several SmartEVSEs."""
-        self.protocol = PROTOCOLS["smartevse_master"]
-        return await self.async_step_port()
-
-    async def async_step_connection(
-        self,
-        user_input: dict[str, Any] | None = None,  # noqa: ARG002
-    ) -> ConfigFlowResult:
-        """Choose how an EWS-Box is connected."""
+        """Choose one of several protocols of a make."""
+        menu = self._protocols[0].make.menu
         return self.async_show_menu(
-            step_id="connection", menu_options=["ews_serial", "ews_network"]
+            step_id=self.add_step(menu, self._async_choose_protocol),
+            menu_options=[
+                self.add_step(protocol.choice, partial(self._async_use, protocol))
+                for protocol in self._protocols
+            ],
         )
 
-    async def async_step_ews_serial(
+    async def _async_use(
         self,
+        protocol: Protocol,
         user_input: dict[str, Any] | None = None,  # noqa: ARG002
     ) -> ConfigFlowResult:
-        """Set up one EWS-Box on RS-232."""
-        self.protocol = PROTOCOLS["ews"]
+        """Set up a bus of this protocol, or a listener if its boxes dial."""
+        self.protocol = protocol
+        if protocol.dials_in:
+            return await self.async_step_listen()
         return await self.async_step_port()
 
     async def async_step_port(
@@ -169,8 +151,8 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
             if not errors:
                 if self.protocol.probe_sets_limits:
                     return await self.async_step_impose()
-                self._searches = nothing_imposed(self.protocol)
-                if self.protocol.master is not None:
+                self._searches = [read_only_probe(self.protocol)]
+                if self.protocol.supply is not None:
                     return await self.async_step_supply()
                 return await self.async_step_scan()
         usual = self.protocol.settings
@@ -272,13 +254,13 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
         errors: Errors = {}
         if user_input is not None:
             errors = check_impose(self.protocol, user_input)
-            any_address = ADDRESSES[self.protocol.key].any
-            addresses = [any_address] if single and any_address is not None else []
+            form = self.protocol.address
+            addresses = [form.any] if single and form.any is not None else []
             if not single:
-                addresses, wrong = typed_addresses(self.protocol, user_input)
+                addresses, wrong = typed_addresses(form, user_input)
                 errors |= wrong
             if not errors:
-                self._searches = imposed(self.protocol, addresses, user_input)
+                self._searches = probes(self.protocol, addresses, user_input)
                 self.suggestions |= {
                     key: user_input[key]
                     for key in (
@@ -288,8 +270,11 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
                     )
                 }
                 if single:
-                    command = user_input[CONF_COMMAND]
-                    self.suggestions[CONF_EXPERT] = {CONF_COMMAND: command}
+                    self.suggestions[CONF_EXPERT] = {
+                        option.name: user_input[option.name]
+                        for option in self.protocol.options
+                        if option.before_search
+                    }
                 return await self.async_step_scan()
         return self.async_show_form(
             step_id=step_id,
@@ -374,7 +359,7 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
 def _port_placeholders(protocol: Protocol) -> dict[str, str]:
     return {
         "protocol": protocol.name,
-        "interface": _INTERFACES.get(protocol.key, "RS-485"),
+        "interface": protocol.interface,
         "settings": str(protocol.settings),
         "examples": _URL_EXAMPLES,
     }
@@ -382,4 +367,4 @@ def _port_placeholders(protocol: Protocol) -> dict[str, str]:
 
 def _title(data: Mapping[str, Any]) -> str:
     """Return the default title of a bus."""
-    return f"{short_name(protocol_of(data))} bus ({port_name(data[CONF_DEVICE])})"
+    return f"{protocol_of(data).make.name} bus ({port_name(data[CONF_DEVICE])})"

@@ -1,7 +1,7 @@
 """From the data of config entries to the configuration of the library. Pure."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from datetime import tzinfo
 from typing import TYPE_CHECKING, Any, Final
 
@@ -9,21 +9,17 @@ from homeassistant.const import CONF_ADDRESS
 
 from .const import (
     CONF_BAUDRATE,
-    CONF_COMMAND,
     CONF_FAIL_SAFE_CURRENT,
     CONF_FAIL_SAFE_TIMEOUT,
-    CONF_INFORMATION,
     CONF_INSTALLATION_LIMIT,
     CONF_INSTALLATION_LIMIT_2,
     CONF_ORDER_LIFETIME,
     CONF_PARITY,
-    CONF_PHASE_ORDER,
     CONF_POLL_INTERVAL,
     CONF_PORTS,
     CONF_PROTOCOL,
     CONF_SERIAL,
     CONF_STOP_BITS,
-    CONF_STOP_ON_SHUTDOWN,
     CONF_SUPPLY_LIMIT,
     CONF_SUPPLY_MINIMUM,
     CONF_VOLTAGE,
@@ -48,24 +44,9 @@ _OPTIONAL_FIELDS: Final[Mapping[str, Callable[[Any], object]]] = {
     CONF_VOLTAGE: float,
     CONF_POLL_INTERVAL: float,
     CONF_ORDER_LIFETIME: lambda minutes: float(minutes) * 60,
-    # Fields of single protocols.
-    CONF_COMMAND: int,
-    CONF_INFORMATION: bytes.fromhex,
-    CONF_PHASE_ORDER: tuple,
-    CONF_STOP_ON_SHUTDOWN: bool,
 }
 """Fields that may be missing or None, with the conversion of the stored value."""
 
-_LIVE_FIELDS: Final = (
-    "name",
-    "installation_limit",
-    "voltage",
-    "poll_interval",
-    "order_lifetime",
-    "stop_on_shutdown",
-    "time_zone",
-)
-"""Fields that a charger reads from its configuration at each use."""
 _LIVE_KEYS: Final = (CONF_SUPPLY_LIMIT, CONF_SUPPLY_MINIMUM)
 """Keys that can change while the bus runs: a new bus would be silent for a while."""
 
@@ -73,22 +54,11 @@ _DEFAULT_TIMEOUT: Final = 60
 
 PORT_LIMITS: Final = (CONF_INSTALLATION_LIMIT, CONF_INSTALLATION_LIMIT_2)
 """Keys of the installation limits of a box's ports."""
-_FAMILIES: Final = {"ews_network": "ews"}
-"""Protocols that share serial numbers with another one: the same boxes speak both."""
 
 
 def protocol_of(data: Mapping[str, Any]) -> Protocol:
     """Return the protocol of a config entry's data."""
     return PROTOCOLS[data[CONF_PROTOCOL]]
-
-
-def charger_unique_id(
-    protocol: str, serial: str | None, address: int | str | None = None
-) -> str:
-    """Return the unique id of a charger's subentry: by serial number, else address."""
-    if serial is None:
-        return f"{protocol}_address_{address}"
-    return f"{_FAMILIES.get(protocol, protocol)}_{serial}"
 
 
 def line_settings(data: Mapping[str, Any]) -> LineSettings:
@@ -108,7 +78,7 @@ def rebuild_data(data: Mapping[str, Any]) -> dict[str, Any]:
 
 def supply_of(data: Mapping[str, Any]) -> Supply | None:
     """Return the supply that the chargers share; ``None``: they share none."""
-    if protocol_of(data).master is None:
+    if protocol_of(data).supply is None:
         return None
     return Supply(
         limit=float(data.get(CONF_SUPPLY_LIMIT, MINIMUM_CURRENT)),
@@ -126,11 +96,16 @@ def charger_configs(
     """
     stored = subentry.data
     protocol = protocol_of(data)
+    conversions = dict(_OPTIONAL_FIELDS) | {
+        option.name: option.load for option in protocol.options
+    }
     optional: dict[str, Any] = {
         key: convert(stored[key])
-        for key, convert in _OPTIONAL_FIELDS.items()
+        for key, convert in conversions.items()
         if stored.get(key) is not None
     }
+    if protocol.sets_clock:
+        optional["time_zone"] = zone
     if protocol.ports == 1:
         one = protocol.config(
             key=subentry.subentry_id,
@@ -141,7 +116,6 @@ def charger_configs(
         )
         return [one]
     count = port_count(stored)
-    clock: dict[str, Any] = {"time_zone": zone}
     return [
         protocol.config(
             key=f"{subentry.subentry_id}_{port}",
@@ -149,7 +123,6 @@ def charger_configs(
             address=port,
             installation_limit=float(stored[limit]),
             **optional,
-            **clock,
         )
         for port, limit in enumerate(PORT_LIMITS[:count], start=1)
     ]
@@ -181,10 +154,10 @@ def initial_orders(subentry: ConfigSubentry, config: ChargerConfig) -> Orders:
 def changes_in_place(old: ChargerConfig, new: ChargerConfig) -> bool:
     """Return whether a running charger can take a new configuration.
 
-    All but the `_LIVE_FIELDS` are read once, when the charger is created. A serial
-    number that was not set before is the one the charger has read itself.
+    It cannot if a field has changed that is read only once, when the charger is
+    created. A serial number that was not set before is the one it has read itself.
     """
-    names = {one.name for one in fields(old)}.intersection(_LIVE_FIELDS)
+    names = set(old.live)
     if old.serial is None:
         names.add("serial")
     same = {name: getattr(old, name) for name in names}

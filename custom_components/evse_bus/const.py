@@ -51,11 +51,6 @@ CONF_FAIL_SAFE_CURRENT: Final = "fail_safe_current"
 """A; used in the first orders of a charger only."""
 CONF_FAIL_SAFE_TIMEOUT: Final = "fail_safe_timeout"
 """s; used in the first orders of a charger only (EVBox)."""
-CONF_COMMAND: Final = "command"
-"""68 or 69 (EVBox)."""
-CONF_INFORMATION: Final = "information"
-"""The information module as 32 hex digits (EVBox)."""
-CONF_PHASE_ORDER: Final = "phase_order"
-"""The phases of the first, second and third current (ABL)."""
-CONF_STOP_ON_SHUTDOWN: Final = "stop_on_shutdown"
-"""Stop charging when Home Assistant stops (SmartEVSE, polled)."""
+
+# What else is stored of a charger are the options of its protocol (`evse/options.py`),
+# each under its name.

@@ -20,7 +20,6 @@ from homeassistant.util import dt as dt_util
 from .configuration import (
     changes_in_place,
     charger_configs,
-    charger_unique_id,
     initial_orders,
     protocol_of,
     rebuild_data,
@@ -310,7 +309,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         subentry = managed.subentry
         if info is None or info.serial is None or subentry.data.get(CONF_SERIAL):
             return
-        unique_id = charger_unique_id(self.protocol.key, info.serial)
+        unique_id = self.protocol.unique_id(info.serial)
         if any(
             other.unique_id == unique_id
             for other in self.config_entry.subentries.values()

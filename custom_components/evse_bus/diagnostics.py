@@ -18,19 +18,12 @@ from .evse.bus import Bus
 from .evse.smartevse import Master
 from .evse.statistics import Direction
 from .managed_charger import ManagedCharger
-from .redaction import on_wire, without_serial
 
-# The path of an adapter and a network address identify a house, as a serial number
-# does. An EVBox is addressed by its serial number.
-_PRIVATE: Final = {
-    CONF_DEVICE,
-    CONF_HOST,
-    CONF_SERIAL,
-    "information",
-    "serials",
-    "user",
-}
-_PRIVATE_ADDRESS: Final = {"evbox"}
+_PRIVATE: Final = frozenset({CONF_DEVICE, CONF_HOST, CONF_SERIAL, "user"})
+"""Keys that identify a person or house, in any protocol.
+
+The path of an adapter and a network address do, as a serial number does.
+"""
 
 
 async def async_get_config_entry_diagnostics(
@@ -139,7 +132,8 @@ def _charger(coordinator: BusCoordinator, managed: ManagedCharger) -> dict[str, 
     config: dict[str, Any] = plain(charger.config)
     # The name given by the user may be that of a person or a place.
     config |= {"key": REDACTED, "name": REDACTED}
-    if coordinator.protocol.key in _PRIVATE_ADDRESS:
+    protocol = coordinator.protocol
+    if protocol.address.is_serial and protocol.ports == 1:
         config[CONF_ADDRESS] = REDACTED
     data = {
         "config": config,
@@ -156,26 +150,25 @@ def _charger(coordinator: BusCoordinator, managed: ManagedCharger) -> dict[str, 
         "reading": plain(charger.reading),
         "statistics": plain(charger.statistics),
     }
-    return async_redact_data(data, _PRIVATE)
+    return async_redact_data(data, _PRIVATE | protocol.private)
 
 
 def _frames(
     coordinator: BusCoordinator, bus: Bus, chargers: Sequence[ManagedCharger]
 ) -> list[dict[str, str]]:
     """Return the last frames of a bus, with the serial numbers hidden."""
-    protocol = coordinator.protocol.key
+    numbers = coordinator.protocol.serials
     known: set[str | None] = set()
     for managed in chargers:
         known.add(managed.charger.config.serial)
         if managed.charger.info is not None:
             known.add(managed.charger.info.serial)
-    serials = on_wire(protocol, known)
+    serials = numbers.encoded(known)
     return [
         {
             "time": datetime.fromtimestamp(frame.when, UTC).isoformat(),
             "direction": str(frame.direction),
-            "hex": without_serial(
-                protocol,
+            "hex": numbers.hide(
                 frame.data,
                 serials,
                 whole=frame.direction is not Direction.UNREADABLE,

@@ -1,4 +1,4 @@
-"""Boxes that dial a listener and are not set up: told to the user, nothing more."""
+"""Discovery flows for unknown boxes that dial a listener."""
 
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final
@@ -14,7 +14,8 @@ from homeassistant.helpers.discovery_flow import DiscoveryKey
 from homeassistant.helpers.dispatcher import async_dispatcher_connect
 from homeassistant.helpers.start import async_at_started
 
-from .const import DOMAIN
+from .configuration import protocol_of
+from .const import CONF_PROTOCOL, CONF_SERIAL, DOMAIN
 
 if TYPE_CHECKING:
     from homeassistant.config_entries import (
@@ -31,36 +32,38 @@ CONF_FIRMWARE: Final = "firmware"
 CONF_PEER: Final = "peer"
 
 MOST_OFFERS: Final = 16
-"""Boxes offered at once. Whoever can connect can give any number of serial numbers."""
+"""Discovery flows at once: a client may send any number of serial numbers."""
 
-_OFFERED: Final[ConfigFlowContext] = {"source": SOURCE_INTEGRATION_DISCOVERY}
+_DISCOVERED: Final[ConfigFlowContext] = {"source": SOURCE_INTEGRATION_DISCOVERY}
 
 
 @callback
 def async_wants_to_connect(
     hass: HomeAssistant, entry: ConfigEntry, stranger: Stranger
 ) -> None:
-    """Offer a box that has dialled; it may be added, or ignored."""
+    """Start a discovery flow for an unknown box that has dialled."""
     if hass.state is not CoreState.running:
-        # Home Assistant would keep any number of offers until it has started.
+        # Until it has started, Home Assistant would queue any number of flows.
         return
-    unique_id = box_unique_id(stranger.serial)
+    protocol = protocol_of(entry.data)
+    unique_id = protocol.unique_id(stranger.serial)
     flows = hass.config_entries.flow.async_progress_by_handler(
-        DOMAIN, include_uninitialized=True, match_context=dict(_OFFERED)
+        DOMAIN, include_uninitialized=True, match_context=dict(_DISCOVERED)
     )
     if is_set_up(hass, unique_id) or len(flows) >= MOST_OFFERS:
         return
     discovery_flow.async_create_flow(
         hass,
         DOMAIN,
-        context=_OFFERED,
+        context=_DISCOVERED,
         data={
             CONF_ENTRY: entry.entry_id,
-            "serial": stranger.serial,
+            CONF_PROTOCOL: protocol.key,
+            CONF_SERIAL: stranger.serial,
             CONF_FIRMWARE: stranger.firmware,
             CONF_PEER: str(stranger.peer or ""),
         },
-        # By this we are told when it is no longer ignored.
+        # Home Assistant signals by this key when the box is no longer ignored.
         discovery_key=DiscoveryKey(domain=DOMAIN, key=unique_id, version=1),
     )
 
@@ -69,9 +72,9 @@ def async_wants_to_connect(
 def async_offer_when_started(
     hass: HomeAssistant, entry: ConfigEntry, listener: Listener
 ) -> CALLBACK_TYPE:
-    """Offer the boxes that have dialled while Home Assistant was starting.
+    """Offer boxes that have dialled during startup, once Home Assistant has started.
 
-    Returns what ends this.
+    Returns a function that cancels this.
     """
 
     @callback
@@ -86,32 +89,28 @@ def async_offer_when_started(
 def async_follow_ignored(
     hass: HomeAssistant, entry: ConfigEntry, listener: Listener
 ) -> CALLBACK_TYPE:
-    """Offer a box that is no longer ignored at once, not when it dials next.
+    """Offer a box as soon as it is no longer ignored, not when it dials next.
 
-    Returns what ends this.
+    Returns a function that ends this.
     """
+    protocol = protocol_of(entry.data)
 
     @callback
     def removed(ignored: ConfigEntry) -> None:
         for stranger in listener.strangers:
-            if box_unique_id(stranger.serial) == ignored.unique_id:
+            if protocol.unique_id(stranger.serial) == ignored.unique_id:
                 async_wants_to_connect(hass, entry, stranger)
 
     signal = signal_discovered_config_entry_removed(DOMAIN)
     return async_dispatcher_connect(hass, signal, removed)
 
 
-def box_unique_id(serial: str) -> str:
-    """Return the unique id of an EWS-Box, however it is connected."""
-    return f"ews_{serial}"
-
-
 def is_set_up(
     hass: HomeAssistant, unique_id: str, but: ConfigSubentry | None = None
 ) -> bool:
-    """Return whether a box is set up, at this listener or anywhere else.
+    """Return whether a box is set up, at this listener or any other bus.
 
-    ``but``: the one that is being changed.
+    ``but`` is the subentry being reconfigured.
     """
     return any(
         subentry.unique_id == unique_id
@@ -121,20 +120,20 @@ def is_set_up(
     )
 
 
-# -- Offers that are taken back --------------------------------------------------
+# -- Ending discovery flows ------------------------------------------------------
 
 
 @callback
 def async_set_up_now(hass: HomeAssistant, subentry: ConfigSubentry) -> None:
-    """Take back the offer of a box that has been set up in another way."""
-    # The dialogue that has just added it may be about to end by itself.
-    hass.loop.call_soon(_take_back, hass, subentry.unique_id)
+    """End the discovery flow of a box that was set up in another way."""
+    # Not at once: the flow that has just added the box ends by itself.
+    hass.loop.call_soon(_end_discovery, hass, subentry.unique_id)
 
 
-def _take_back(hass: HomeAssistant, unique_id: str | None) -> None:
+def _end_discovery(hass: HomeAssistant, unique_id: str | None) -> None:
     manager = hass.config_entries.flow
     for flow in manager.async_progress_by_handler(
-        DOMAIN, match_context={**_OFFERED, "unique_id": unique_id}
+        DOMAIN, match_context={**_DISCOVERED, "unique_id": unique_id}
     ):
         with suppress(UnknownFlow):
             manager.async_abort(flow["flow_id"])
@@ -142,9 +141,9 @@ def _take_back(hass: HomeAssistant, unique_id: str | None) -> None:
 
 @callback
 def async_listener_gone(hass: HomeAssistant, entry: ConfigEntry) -> None:
-    """Take back all offers of a listener, but for those that somebody is looking at.
+    """End the discovery flows of a removed listener.
 
-    They are told so when they try to add the box.
+    A flow that is open in a browser stays, and aborts when the box is to be added.
     """
     hass.config_entries.flow.async_dismiss_discovery_flows(
         dict, lambda data: data.get(CONF_ENTRY) == entry.entry_id

@@ -8,6 +8,7 @@ This module imports nothing of the project and nothing of Home Assistant.
 
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
+from typing import ClassVar
 
 MINIMUM_CURRENT = 6.0
 """Lowest current a charger can offer a car, A (IEC 61851-1, annex A)."""
@@ -357,6 +358,11 @@ class Limits:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChargerConfig:
     """The configuration of one charger; protocols add their own fields."""
+
+    live: ClassVar[frozenset[str]] = frozenset(
+        {"name", "installation_limit", "voltage", "poll_interval", "order_lifetime"}
+    )
+    """Fields that a charger reads at each use: it can follow a change of these."""
 
     key: str
     """Identifies the charger for as long as it is configured; not its address."""

@@ -1,15 +1,23 @@
-"""The description of a protocol: how its line is set, its chargers made and found."""
+"""The description of a protocol: all that the rest of the project knows of it.
+
+How its line is set and its chargers made and found, and, as plain data, how a user
+interface asks for its chargers: names, addresses, options. A protocol's folder has one
+such description for each way in which its chargers are used.
+"""
 
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
 
+from .address import AddressForm
 from .bus import Bus
 from .charger import Charger
 from .framing import Frame, Framer, LineSettings, Timing
 from .line import Line
 from .master import BusMaster, ChargerGroup
 from .model import ChargerConfig, Orders, Supply
+from .options import Option
+from .redaction import SerialNumbers
 from .scan import ScanResult
 
 type Progress = Callable[[float], None]
@@ -17,11 +25,46 @@ type Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Protocol[C: ChargerConfig = Any]:
-    """One protocol: how its line is set, how to make and find its chargers."""
+class Make:
+    """The chargers of one folder, as people choose them."""
 
     key: str
+    """Key of the choice and of its text."""
     name: str
+    """Short name of one charger, for titles."""
+    plural: str = ""
+    """The same of several; only where boxes dial."""
+    menu: str = ""
+    """Menu in which one of its protocols is chosen; only where it has several."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SupplyRange:
+    """Range of what the chargers of a bus share."""
+
+    highest: float
+    """Highest limit of all chargers together, A per phase."""
+    highest_minimum: float
+    """Highest minimum for each charger that charges, A."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Protocol[C: ChargerConfig = Any]:
+    """One protocol: its line, its chargers, and how to ask for them."""
+
+    # -- Names -----------------------------------------------------------------------
+
+    key: str
+    """Stored in config entries; part of the keys of texts: ``scan_<key>`` (progress of
+    a search) and ``confirm_<key>`` (last step, which explains the fail-safe)."""
+    name: str
+    """Full name, for texts."""
+    make: Make
+    choice: str = ""
+    """Key of this protocol in the menu of its make, where that has one."""
+
+    # -- The line and the chargers ---------------------------------------------------
+
     settings: LineSettings
     timing: Timing
     framer: Callable[[], Framer[Frame]]
@@ -33,8 +76,11 @@ class Protocol[C: ChargerConfig = Any]:
 
     ``config`` and ``orders`` are sent where `probe_sets_limits` is true.
     """
+    interface: str = "RS-485"
+    """Interface that the adapter needs."""
     probe_sets_limits: bool = False
-    """Every message sets limits, so a scan does too: ask for the values first."""
+    """Every message sets limits, so a scan does too: ask for the values first. The
+    chargers have a fail-safe time-out, which is one of these values."""
     ports: int = 1
     """Most ports of one box, each a charger of its own (`ChargerConfig.address` is its
     number); 1: a box is one charger."""
@@ -44,6 +90,37 @@ class Protocol[C: ChargerConfig = Any]:
     """Makes the master of the bus, where Home Assistant is that."""
     group: Callable[[], ChargerGroup] | None = None
     """Makes the owner of what the chargers of one bus share, where they are one box."""
+
+    # -- What a user is asked for ----------------------------------------------------
+
+    address: AddressForm
+    options: tuple[Option, ...] = ()
+    supply: SupplyRange | None = None
+    """Of the shared supply; ``None``: the chargers share none. Needs a `master`."""
+    asks_voltage: bool = True
+    """The chargers report no power; it is estimated from the configured voltage."""
+    sets_clock: bool = False
+    """The clock of a box is kept right: its configuration has a ``time_zone``."""
+    lifetime_is_fail_safe: bool = False
+    """Nothing in a charger ends a charge when no message comes: the order lifetime is
+    asked for among the first fields, not folded away."""
+
+    # -- Identity and privacy --------------------------------------------------------
+
+    serials: SerialNumbers
+    """Serial numbers in frames."""
+    serial_family: str | None = None
+    """Common to all protocols by which the same boxes can be reached: a serial number
+    is set up only once among them. ``None``: no other protocol reaches them."""
+    private: frozenset[str] = frozenset()
+    """Fields of configurations, readings and infos that identify a person or house,
+    beside serial numbers."""
+
+    def unique_id(self, serial: str | None, address: int | str | None = None) -> str:
+        """Return a unique id of a charger: by its serial number, else its address."""
+        if serial is None:
+            return f"{self.key}_address_{address}"
+        return f"{self.serial_family or self.key}_{serial}"
 
     def bus(
         self,

@@ -1,36 +1,31 @@
-"""The form for one charger: what is asked, what is refused, what is stored. Pure."""
+"""The form for one charger: its fields, their validation, the stored data. Pure."""
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from homeassistant.const import CONF_ADDRESS, CONF_NAME
 from homeassistant.data_entry_flow import section
-from homeassistant.helpers.selector import BooleanSelector, TextSelector
+from homeassistant.helpers.selector import TextSelector
 import probatio as vol
 
 from ..configuration import PORT_LIMITS
 from ..const import (
-    CONF_COMMAND,
     CONF_FAIL_SAFE_CURRENT,
     CONF_FAIL_SAFE_TIMEOUT,
-    CONF_INFORMATION,
     CONF_INSTALLATION_LIMIT,
     CONF_INSTALLATION_LIMIT_2,
     CONF_ORDER_LIFETIME,
-    CONF_PHASE_ORDER,
     CONF_POLL_INTERVAL,
     CONF_PORTS,
     CONF_SERIAL,
-    CONF_STOP_ON_SHUTDOWN,
     CONF_VOLTAGE,
 )
 from ..evse.model import MINIMUM_CURRENT
+from ..evse.options import Choice, Quantity, Toggle
 from ..evse.safety import MAXIMUM_TIMEOUT
-from ..evse.scan import Address
-from .address import ADDRESSES, Errors
+from .address import Errors, address_field
 from .schema import (
-    COMMANDS,
     DEFAULT_FAIL_SAFE_TIMEOUT,
     amperes,
     check_currents,
@@ -39,88 +34,84 @@ from .schema import (
     dropdown,
     is_number,
     model_name,
+    option_fields,
     quantity,
 )
 
 if TYPE_CHECKING:
     from homeassistant.config_entries import ConfigSubentry, ConfigSubentryData
 
+    from ..evse.options import Option
     from ..evse.protocol import Protocol
-    from ..evse.scan import FoundCharger
+    from ..evse.scan import Address, FoundCharger
 
 CONF_EXPERT: Final = "expert"
+"""Key of the collapsed section."""
 
 LONGEST_POLL_INTERVAL: Final = 3600
+"""s"""
 LONGEST_ORDER_LIFETIME: Final = 7 * 24 * 60
-INFORMATION_BYTES: Final = 16
-PHASE_ORDERS: Final = ("123", "132", "213", "231", "312", "321")
+"""min"""
 
 YES: Final = "✓"
 NO: Final = "-"
-"""In tables, where a word would have to be translated."""
+"""In tables, instead of words that would have to be translated."""
 
-
-_PRODUCTS: Final = {"ews": "EWS-Box", "ews_network": "EWS-Box"}
 _NAME_DIGITS: Final = 8
-"""So much of an address is enough to tell chargers apart."""
-_TELL_POWER: Final = frozenset(_PRODUCTS)
-"""Protocols whose chargers need no voltage to estimate power from."""
+"""Characters of an address that a default name contains."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Candidate:
-    """A charger on its way into the configuration."""
+    """A charger that is about to be added."""
 
     address: Address
     found: FoundCharger | None = None
-    """What it told, if it has been asked and has answered."""
+    """Result of the search, if it was searched for and has answered."""
 
     def serial(self, protocol: Protocol) -> str | None:
-        """Return its serial number, as far as known."""
+        """Return its serial number, if known."""
         if self.found is not None and self.found.serial is not None:
             return self.found.serial
-        return ADDRESSES[protocol.key].serial(self.address)
+        return protocol.address.serial(self.address)
 
     def placeholders(self, protocol: Protocol) -> dict[str, str]:
-        """Return what is known of it, for the texts."""
-        told = self.found
-        each = (told.maximum_currents or (told.maximum_current,)) if told else (None,)
+        """Return the placeholders for the texts of its form."""
+        found = self.found
+        each = (
+            (found.maximum_currents or (found.maximum_current,)) if found else (None,)
+        )
         return {
-            "address": ADDRESSES[protocol.key].show(self.address),
-            "model": model_name(told) if told else "?",
-            "firmware": (told and told.info.firmware) or "?",
+            "address": protocol.address.show(self.address),
+            "model": model_name(found) if found else "?",
+            "firmware": (found and found.info.firmware) or "?",
             "serial": self.serial(protocol) or "?",
             "maximum": " + ".join("?" if one is None else f"{one:g} A" for one in each),
         }
 
     def suggestions(self, protocol: Protocol, limit: float) -> dict[str, Any]:
-        """Return what its form is to begin with; ``limit``: of the installation.
+        """Return suggested values for its form; ``limit``: of the installation, A.
 
-        What a port can carry at most is no more than its box has been set up for:
-        a higher limit would only look as if it could be had.
+        The suggested limit of a port is not above the maximum that the box reports for
+        it: a higher one would have no effect.
         """
         each = self.found.maximum_currents if self.found else ()
         if not each:
             return dict.fromkeys(PORT_LIMITS[: protocol.ports], limit)
         limits = (
-            limit if told is None else max(MINIMUM_CURRENT, min(limit, told))
-            for told in each
+            limit if maximum is None else max(MINIMUM_CURRENT, min(limit, maximum))
+            for maximum in each
         )
         offered = dict(zip(PORT_LIMITS, limits, strict=False))
         return {CONF_PORTS: str(len(each)), **offered}
 
 
-def short_name(protocol: Protocol) -> str:
-    """Return what people call these chargers: the maker's name, or the product's."""
-    return _PRODUCTS.get(protocol.key) or protocol.name.split()[0]
-
-
 def default_name(protocol: Protocol, address: Address) -> str:
-    """Return the name offered for a charger."""
-    form = ADDRESSES[protocol.key]
-    if form.alone:
-        return short_name(protocol)
-    return f"{short_name(protocol)} {form.show(address)[-_NAME_DIGITS:]}"
+    """Return the suggested name of a charger."""
+    form = protocol.address
+    if form.single:
+        return protocol.make.name
+    return f"{protocol.make.name} {form.show(address)[-_NAME_DIGITS:]}"
 
 
 # -- The form --------------------------------------------------------------------
@@ -129,17 +120,17 @@ def default_name(protocol: Protocol, address: Address) -> str:
 def charger_form(
     protocol: Protocol, *, ask_address: bool = False, new: bool = True
 ) -> vol.Schema:
-    """Ask for one charger's name, limits and, collapsed, everything else.
+    """Return the form for a charger: name, limits, and a section with the rest.
 
-    ``ask_address``: also where it is and who it must be. The fail-safe values are
-    asked only of a new charger: later they are entities of its own.
+    ``ask_address``: also its address and serial number. The fail-safe values are asked
+    for only when a charger is added; later they are entities.
     """
-    address = ADDRESSES[protocol.key]
+    address = protocol.address
     form: dict[vol.Marker, object] = {vol.Required(CONF_NAME): TextSelector()}
     if ask_address:
         marker = vol.Optional if address.optional else vol.Required
-        form[marker(address.one)] = address.selector
-        if address.tells_serial and not address.is_serial:
+        form[marker(address.key)] = address_field(address)
+        if address.has_serial and not address.is_serial:
             form[vol.Optional(CONF_SERIAL)] = TextSelector()
     if protocol.ports > 1:
         counts = tuple(str(count) for count in range(1, protocol.ports + 1))
@@ -155,9 +146,9 @@ def charger_form(
             form[
                 vol.Required(CONF_FAIL_SAFE_TIMEOUT, default=DEFAULT_FAIL_SAFE_TIMEOUT)
             ] = quantity(1, MAXIMUM_TIMEOUT, 1, "s")
-    if _lacks_fail_safe(protocol):
+    if protocol.lifetime_is_fail_safe:
         form |= _LIFETIME
-        form[vol.Required(CONF_STOP_ON_SHUTDOWN, default=False)] = BooleanSelector()
+    form |= option_fields(_prominent(protocol))
     form[vol.Required(CONF_EXPERT)] = section(
         _expert_form(protocol), {"collapsed": True}
     )
@@ -169,12 +160,8 @@ _LIFETIME: Final[Mapping[vol.Marker, object]] = {
 }
 
 
-def _lacks_fail_safe(protocol: Protocol) -> bool:
-    """Return whether nothing in the box itself ever ends a charge.
-
-    Then what there is instead is not folded away.
-    """
-    return _has(protocol, CONF_STOP_ON_SHUTDOWN)
+def _prominent(protocol: Protocol) -> list[Option]:
+    return [option for option in protocol.options if option.prominent]
 
 
 def _expert_form(protocol: Protocol) -> vol.Schema:
@@ -183,39 +170,26 @@ def _expert_form(protocol: Protocol) -> vol.Schema:
             CONF_POLL_INTERVAL, default=default_of(protocol, CONF_POLL_INTERVAL)
         ): quantity(0, LONGEST_POLL_INTERVAL, 0.1, "s"),
     }
-    if protocol.key not in _TELL_POWER:
+    if protocol.asks_voltage:
         form[vol.Required(CONF_VOLTAGE, default=default_of(protocol, CONF_VOLTAGE))] = (
             quantity(100, 300, 0.1, "V")
         )
-    if not _lacks_fail_safe(protocol):
+    if not protocol.lifetime_is_fail_safe:
         form |= _LIFETIME
-    if _has(protocol, CONF_COMMAND):
-        form[
-            vol.Required(CONF_COMMAND, default=str(default_of(protocol, CONF_COMMAND)))
-        ] = dropdown(CONF_COMMAND, COMMANDS)
-    if _has(protocol, CONF_INFORMATION):
-        zeros = bytes(INFORMATION_BYTES).hex()
-        form[vol.Required(CONF_INFORMATION, default=zeros)] = TextSelector()
-    if _has(protocol, CONF_PHASE_ORDER):
-        form[vol.Required(CONF_PHASE_ORDER, default=PHASE_ORDERS[0])] = dropdown(
-            CONF_PHASE_ORDER, PHASE_ORDERS
-        )
+    form |= option_fields(one for one in protocol.options if not one.prominent)
     return vol.Schema(form)
 
 
-def _has(protocol: Protocol, name: str) -> bool:
-    return any(one.name == name for one in fields(protocol.config))
-
-
 def check_charger(
-    typed: Mapping[str, Any], others: Collection[Mapping[str, Any]]
+    protocol: Protocol,
+    typed: Mapping[str, Any],
+    others: Collection[Mapping[str, Any]],
 ) -> Errors:
-    """Return what is wrong with a filled-in charger form.
+    """Return the errors in a filled-in charger form.
 
-    ``others``: what is stored, or known so far, of the bus's other chargers.
-
-    What is in the collapsed section is reported for the whole form: nobody sees a
-    mark on a field that is folded away.
+    ``others``: stored data, as far as known, of the other chargers of the bus. Errors
+    in the collapsed section are reported for the whole form: a mark on a hidden field
+    would not be seen.
     """
     errors = check_currents(typed)
     expert = typed[CONF_EXPERT]
@@ -229,16 +203,14 @@ def check_charger(
     if not all(is_number(expert[key]) for key in numbers if key in expert):
         errors["base"] = "expert_not_a_number"
         return errors
-    if not _is_information(expert.get(CONF_INFORMATION)):
-        errors["base"] = "bad_information"
-    commands = {expert.get(CONF_COMMAND), *(str(o.get(CONF_COMMAND)) for o in others)}
-    if others and COMMANDS[-1] in commands:
-        errors["base"] = "command_not_alone"
+    for option in protocol.options:
+        if (wrong := _check_option(option, typed, others)) is not None:
+            errors.setdefault(option.name if option.prominent else "base", wrong)
     return errors | check_timeout(typed, expert[CONF_POLL_INTERVAL])
 
 
 def _check_second(typed: Mapping[str, Any]) -> Errors:
-    """Return what is wrong with the limit of a second port."""
+    """Return the errors in the limit of a second port."""
     if (limit := typed.get(CONF_INSTALLATION_LIMIT_2)) is None:
         return {CONF_INSTALLATION_LIMIT_2: "second_limit_missing"}
     if typed.get(CONF_FAIL_SAFE_CURRENT, 0) > limit:
@@ -246,22 +218,36 @@ def _check_second(typed: Mapping[str, Any]) -> Errors:
     return {}
 
 
-def _is_information(text: str | None) -> bool:
-    if text is None:
-        return True
+def _check_option(
+    option: Option,
+    typed: Mapping[str, Any],
+    others: Collection[Mapping[str, Any]],
+) -> str | None:
+    """Return the key of the error in an option; ``None``: there is none."""
     try:
-        return len(bytes.fromhex(text)) == INFORMATION_BYTES
+        stored = option.store(_typed_option(option, typed))
     except ValueError:
-        return False
+        return f"bad_{option.name}"
+    if others and isinstance(option, Choice):
+        # Both ways: neither this charger beside others, nor it beside such a one.
+        each = (stored, *(other.get(option.name) for other in others))
+        if any(map(option.needs_solitude, each)):
+            return f"{option.name}_not_alone"
+    return None
 
 
-# -- What is stored --------------------------------------------------------------
+def _typed_option(option: Option, typed: Mapping[str, Any]) -> object:
+    fields = typed if option.prominent else typed[CONF_EXPERT]
+    return fields.get(option.name, option.default)
+
+
+# -- The stored data -------------------------------------------------------------
 
 
 def charger_data(
-    address: Address, serial: str | None, typed: Mapping[str, Any]
+    protocol: Protocol, address: Address, serial: str | None, typed: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return a subentry's data of a filled-in and checked charger form."""
+    """Return the data of a subentry from a filled-in and checked charger form."""
     expert = typed[CONF_EXPERT]
     data: dict[str, Any] = {
         CONF_ADDRESS: address,
@@ -278,72 +264,73 @@ def charger_data(
         data[CONF_PORTS] = int(typed[CONF_PORTS])
         if data[CONF_PORTS] > 1:
             data[CONF_INSTALLATION_LIMIT_2] = typed[CONF_INSTALLATION_LIMIT_2]
-    for key in (CONF_FAIL_SAFE_CURRENT, CONF_STOP_ON_SHUTDOWN):
-        if key in typed:
-            data[key] = typed[key]
+    if CONF_FAIL_SAFE_CURRENT in typed:
+        data[CONF_FAIL_SAFE_CURRENT] = typed[CONF_FAIL_SAFE_CURRENT]
     if CONF_FAIL_SAFE_TIMEOUT in typed:
         data[CONF_FAIL_SAFE_TIMEOUT] = int(typed[CONF_FAIL_SAFE_TIMEOUT])
-    if CONF_COMMAND in expert:
-        data[CONF_COMMAND] = int(expert[CONF_COMMAND])
-    if CONF_INFORMATION in expert:
-        data[CONF_INFORMATION] = bytes.fromhex(expert[CONF_INFORMATION]).hex().upper()
-    if CONF_PHASE_ORDER in expert:
-        data[CONF_PHASE_ORDER] = [int(one) for one in expert[CONF_PHASE_ORDER]]
+    for option in protocol.options:
+        data[option.name] = option.store(_typed_option(option, typed))
     return data
 
 
 def charger_suggestions(protocol: Protocol, subentry: ConfigSubentry) -> dict[str, Any]:
-    """Return what is stored of a charger as the form shows it."""
+    """Return the stored data of a charger as values of its form."""
     stored = subentry.data
-    address = ADDRESSES[protocol.key]
+    address = protocol.address
     place: Address = stored[CONF_ADDRESS]
     if address.optional and stored[CONF_SERIAL]:
-        # The one that was kept: left empty, any other would be taken from now on.
+        # The serial number that was found: if left empty, any box would be accepted.
         place = stored[CONF_SERIAL]
     expert = {
         key: stored[key]
         for key in (CONF_VOLTAGE, CONF_POLL_INTERVAL, CONF_ORDER_LIFETIME)
         if stored.get(key) is not None
     }
-    if CONF_COMMAND in stored:
-        expert[CONF_COMMAND] = str(stored[CONF_COMMAND])
-    if CONF_INFORMATION in stored:
-        expert[CONF_INFORMATION] = stored[CONF_INFORMATION]
-    if CONF_PHASE_ORDER in stored:
-        expert[CONF_PHASE_ORDER] = "".join(map(str, stored[CONF_PHASE_ORDER]))
     suggestions = {
         CONF_NAME: subentry.title,
-        address.one: address.show(place),
+        address.key: address.show(place),
         CONF_INSTALLATION_LIMIT: stored[CONF_INSTALLATION_LIMIT],
         CONF_EXPERT: expert,
     }
+    for option in protocol.options:
+        if stored.get(option.name) is not None:
+            fields = suggestions if option.prominent else expert
+            fields[option.name] = option.show(stored[option.name])
     if CONF_PORTS in stored:
         suggestions[CONF_PORTS] = str(stored[CONF_PORTS])
-    more = (
-        CONF_SERIAL,
-        CONF_INSTALLATION_LIMIT_2,
-        CONF_ORDER_LIFETIME,
-        CONF_STOP_ON_SHUTDOWN,
-    )
+    more = (CONF_SERIAL, CONF_INSTALLATION_LIMIT_2, CONF_ORDER_LIFETIME)
     return suggestions | {
         key: stored[key] for key in more if stored.get(key) is not None
     }
 
 
 def confirm_row(protocol: Protocol, charger: ConfigSubentryData) -> str:
-    """Return a new charger as a row of the table that is confirmed last."""
+    """Return a row of the summary table for a new charger."""
     data = charger["data"]
     limits = [f"{data[key]:g} A" for key in PORT_LIMITS if key in data]
     cells = [
         charger["title"].replace("|", "/"),
-        ADDRESSES[protocol.key].show(data[CONF_ADDRESS]) or NO,
+        protocol.address.show(data[CONF_ADDRESS]) or NO,
         " + ".join(limits),
         f"{data[CONF_FAIL_SAFE_CURRENT]:g} A",
     ]
     if CONF_FAIL_SAFE_TIMEOUT in data:
         cells.append(f"{data[CONF_FAIL_SAFE_TIMEOUT]} s")
-    if CONF_STOP_ON_SHUTDOWN in data:
+    if protocol.lifetime_is_fail_safe:
         lifetime = data[CONF_ORDER_LIFETIME]
         cells.append(NO if lifetime is None else f"{lifetime:g} min")
-        cells.append(YES if data[CONF_STOP_ON_SHUTDOWN] else NO)
+    cells += [
+        _cell(option, data[option.name])
+        for option in protocol.options
+        if option.prominent
+    ]
     return f"| {' | '.join(cells)} |"
+
+
+def _cell(option: Option, stored: Any) -> str:  # noqa: ANN401 - JSON
+    """Return a stored value of an option for the summary table."""
+    if isinstance(option, Toggle):
+        return YES if stored else NO
+    if isinstance(option, Quantity):
+        return f"{stored:g} {option.unit}"
+    return str(option.show(stored))

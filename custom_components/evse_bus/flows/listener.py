@@ -1,4 +1,4 @@
-"""Set up a listener that EWS-Boxes dial, change it, and add a box that has dialled."""
+"""Flow steps of a listener: set it up, change it, add a box that has dialled."""
 
 from collections.abc import Mapping
 from contextlib import suppress
@@ -33,6 +33,7 @@ from homeassistant.helpers.selector import (
 )
 import probatio as vol
 
+from ..configuration import protocol_of
 from ..connections import address_name
 from ..const import (
     CONF_ALLOWED,
@@ -43,7 +44,7 @@ from ..const import (
     SUBENTRY_CHARGER,
 )
 from ..coordinator import EvseBusConfigEntry
-from ..discovery import CONF_ENTRY, CONF_FIRMWARE, CONF_PEER, box_unique_id, is_set_up
+from ..discovery import CONF_ENTRY, CONF_FIRMWARE, CONF_PEER, is_set_up
 from ..evse.errors import (
     EvseError,
     LineError,
@@ -56,15 +57,17 @@ from ..evse.protocols import PROTOCOLS
 from ..evse.readings import ChargerInfo
 from ..evse.scan import FoundCharger
 from .address import Errors
-from .charger import Candidate, short_name
+from .charger import Candidate
 from .steps import ChargerSteps
 
 if TYPE_CHECKING:
     from homeassistant.core import HomeAssistant
 
+    from ..evse.protocol import Protocol
+
 FIRST_PORT: Final = 4712
-"""The first TCP port that is offered; the manual names none."""
-_OFFERED: Final = range(FIRST_PORT, FIRST_PORT + 100)
+"""First TCP port that is suggested; the manual of the EWS-Box names none."""
+_SUGGESTED: Final = range(FIRST_PORT, FIRST_PORT + 100)
 HIGHEST_PORT: Final = 65535
 
 _LISTEN_ERRORS: Final[Mapping[type[EvseError], str]] = {
@@ -73,14 +76,14 @@ _LISTEN_ERRORS: Final[Mapping[type[EvseError], str]] = {
     PortPermissionError: "listen_permission",
     LineError: "cannot_listen",
 }
-"""What is said of an error; the first that fits."""
+"""Keys of the error texts; the first class that matches counts."""
 
 
-# -- Where to listen -------------------------------------------------------------
+# -- The address of a listener ---------------------------------------------------
 
 
 def listen_form(addresses: Mapping[str, str], port: int) -> vol.Schema:
-    """Ask for an address of this machine and a port; another address can be typed."""
+    """Return the form for the address of a listener: a list, or typed, and a port."""
     options = [
         SelectOptionDict(value=address, label=label)
         for address, label in addresses.items()
@@ -104,7 +107,7 @@ def listen_form(addresses: Mapping[str, str], port: int) -> vol.Schema:
 
 
 def listen_data(typed: Mapping[str, Any]) -> tuple[dict[str, Any], Errors]:
-    """Return where to listen, of a filled-in form, and what is wrong with it."""
+    """Return the address and port of a filled-in form, and the errors."""
     try:
         host = str(ip_address(typed[CONF_HOST].strip()))
     except ValueError:
@@ -117,7 +120,7 @@ def listen_data(typed: Mapping[str, Any]) -> tuple[dict[str, Any], Errors]:
 
 
 async def async_try_listen(data: Mapping[str, Any]) -> Errors:
-    """Listen for a moment; return what is wrong."""
+    """Listen for a moment; return the errors."""
     listener = Listener(data[CONF_HOST], data[CONF_PORT])
     try:
         await listener.start()
@@ -125,21 +128,21 @@ async def async_try_listen(data: Mapping[str, Any]) -> Errors:
         kind = next(kind for kind in _LISTEN_ERRORS if isinstance(error, kind))
         if kind is LineError:
             where = address_name(data[CONF_HOST], data[CONF_PORT])
-            LOGGER.warning("Nobody can dial %s: %s", where, error)
+            LOGGER.warning("Cannot listen at %s: %s", where, error)
         return {"base": _LISTEN_ERRORS[kind]}
     await listener.stop()
     return {}
 
 
 async def async_own_addresses(hass: HomeAssistant) -> dict[str, str]:
-    """Return this machine's addresses and what to call them.
+    """Return the IPv4 addresses of this machine, with labels.
 
-    The one that it is reached by usually comes first. The boxes know IPv4 only, and
-    their network may well be one that Home Assistant does nothing else in.
+    The one by which it is usually reached comes first. Boxes may be in a network that
+    Home Assistant uses for nothing else.
     """
     addresses: dict[str, str] = {}
     with suppress(HomeAssistantError):
-        # It has no network now.
+        # Raised while there is no network.
         first = await network.async_get_source_ip(hass)
         addresses[first] = first
     for adapter in await network.async_get_adapters(hass):
@@ -151,8 +154,8 @@ async def async_own_addresses(hass: HomeAssistant) -> dict[str, str]:
 
 
 def free_port(host: str) -> int:
-    """Return a port that nobody uses; blocks on the network for a moment."""
-    for port in _OFFERED:
+    """Return an unused TCP port; blocks on the network for a moment."""
+    for port in _SUGGESTED:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         with socket.socket(family, socket.SOCK_STREAM) as probe:
             try:
@@ -164,37 +167,29 @@ def free_port(host: str) -> int:
 
 
 class ListenerSteps(ChargerSteps[ConfigFlowContext, ConfigFlowResult, str], ConfigFlow):
-    """The steps of the config flow that only boxes on the network need."""
+    """Steps of the config flow for boxes that dial in."""
 
     def __init__(self) -> None:
         """Start without a listener."""
         super().__init__()
         self._listener: EvseBusConfigEntry | None = None
-        """Whose box is being added."""
+        """The listener to which a discovered box is being added."""
         self._discovered: FoundCharger
         self._peer = ""
-
-    async def async_step_ews_network(
-        self,
-        user_input: dict[str, Any] | None = None,  # noqa: ARG002 - a step's signature
-    ) -> ConfigFlowResult:
-        """Let boxes dial in."""
-        self.protocol = PROTOCOLS["ews_network"]
-        return await self.async_step_listen()
 
     async def async_step_listen(
         self, user_input: dict[str, Any] | None = None
     ) -> ConfigFlowResult:
-        """Choose where to listen; boxes are added when they dial."""
+        """Choose the address of the listener; boxes are added when they dial."""
         data, result = await self._async_listen("listen", user_input)
         if result is not None:
             return result
         host = data[CONF_HOST]
         if ip_address(host).is_unspecified:
-            # That is no address that could be dialled.
+            # Boxes cannot dial the unspecified address.
             host = next(iter(await async_own_addresses(self.hass)), host)
         return self.async_create_entry(
-            title=listener_title(data),
+            title=listener_title(self.protocol, data),
             data=data,
             description="listening",
             description_placeholders={"address": host, "port": str(data[CONF_PORT])},
@@ -203,14 +198,16 @@ class ListenerSteps(ChargerSteps[ConfigFlowContext, ConfigFlowResult, str], Conf
     async def async_step_reconfigure_listen(
         self, user_input: dict[str, Any] | None = None
     ) -> ConfigFlowResult:
-        """Change where to listen."""
+        """Change the address of the listener."""
         entry = self._get_reconfigure_entry()
+        self.protocol = protocol_of(entry.data)
         data, result = await self._async_listen("reconfigure_listen", user_input, entry)
         if result is not None:
             return result
-        own = entry.title != listener_title(entry.data)
-        title = entry.title if own else listener_title(data)
-        # A loaded listener hears of changes and reloads by itself.
+        # A title set by the user stays.
+        is_own = entry.title != listener_title(self.protocol, entry.data)
+        title = entry.title if is_own else listener_title(self.protocol, data)
+        # The update listener of a loaded entry reloads it.
         update = (
             self.async_update_and_abort
             if entry.update_listeners
@@ -224,14 +221,17 @@ class ListenerSteps(ChargerSteps[ConfigFlowContext, ConfigFlowResult, str], Conf
         typed: dict[str, Any] | None,
         entry: EvseBusConfigEntry | None = None,
     ) -> tuple[dict[str, Any], ConfigFlowResult | None]:
-        """Return an entry's data, or the form to show; ``entry`` is being changed."""
+        """Return the data of the entry, or the form to show.
+
+        ``entry`` is the one being reconfigured.
+        """
         errors: Errors = {}
         if typed is not None:
             where, errors = listen_data(typed)
             if not errors:
                 errors = await self._async_check_listen(where, entry)
             if not errors:
-                return {CONF_PROTOCOL: "ews_network", **where}, None
+                return {CONF_PROTOCOL: self.protocol.key, **where}, None
         addresses = await async_own_addresses(self.hass)
         first = next(iter(addresses), "")
         port = await self.hass.async_add_executor_job(free_port, first)
@@ -247,7 +247,7 @@ class ListenerSteps(ChargerSteps[ConfigFlowContext, ConfigFlowResult, str], Conf
     async def _async_check_listen(
         self, where: Mapping[str, Any], entry: EvseBusConfigEntry | None
     ) -> Errors:
-        """Return what is wrong; aborts when another entry listens there."""
+        """Return the errors; aborts if another entry listens there."""
         self._async_abort_entries_match(dict(where))
         if (
             entry is not None
@@ -256,10 +256,10 @@ class ListenerSteps(ChargerSteps[ConfigFlowContext, ConfigFlowResult, str], Conf
         ):
             hosts = {where[CONF_HOST], entry.data[CONF_HOST]}
             if len(hosts) == 1:
-                # We listen there ourselves.
+                # This entry listens there, so the address can be used.
                 return {}
             if any(ip_address(host).is_unspecified for host in hosts):
-                # We have the port ourselves: only the address is looked at.
+                # This entry has the port open: check the address only.
                 return await async_try_listen({**where, CONF_PORT: 0})
         return await async_try_listen(where)
 
@@ -271,9 +271,10 @@ class ListenerSteps(ChargerSteps[ConfigFlowContext, ConfigFlowResult, str], Conf
     ) -> ConfigFlowResult:
         """Offer a box that has dialled and is not set up."""
         serial = discovery_info[CONF_SERIAL]
-        unique_id = box_unique_id(serial)
+        self.protocol = PROTOCOLS[discovery_info[CONF_PROTOCOL]]
+        unique_id = self.protocol.unique_id(serial)
         await self.async_set_unique_id(unique_id)
-        # An ignored one is such an entry, too.
+        # An ignored box is such an entry, too.
         self._abort_if_unique_id_configured()
         entry = self.hass.config_entries.async_get_entry(discovery_info[CONF_ENTRY])
         if is_set_up(self.hass, unique_id):
@@ -281,10 +282,9 @@ class ListenerSteps(ChargerSteps[ConfigFlowContext, ConfigFlowResult, str], Conf
         if entry is None:
             return self.async_abort(reason="listener_gone")
         self._listener = entry
-        self.protocol = PROTOCOLS["ews_network"]
         self.bus_data = dict(entry.data)
         self.context["title_placeholders"] = {
-            "name": f"{short_name(self.protocol)} {serial}"
+            "name": f"{self.protocol.make.name} {serial}"
         }
         self._discovered = found_box(serial, discovery_info[CONF_FIRMWARE])
         self._peer = discovery_info[CONF_PEER]
@@ -293,7 +293,7 @@ class ListenerSteps(ChargerSteps[ConfigFlowContext, ConfigFlowResult, str], Conf
     async def async_step_discovered(
         self, user_input: dict[str, Any] | None = None
     ) -> ConfigFlowResult:
-        """Say who has dialled; whether it is the right box, only the user can tell."""
+        """Show the box that has dialled; the user decides whether to add it."""
         box = self._discovered
         if user_input is not None:
             return await self.async_begin([Candidate(address=box.address, found=box)])
@@ -310,13 +310,13 @@ class ListenerSteps(ChargerSteps[ConfigFlowContext, ConfigFlowResult, str], Conf
 
     @override
     def others(self) -> list[ConfigSubentry]:
-        """Return the boxes that the listener has already."""
+        """Return the other boxes of the listener."""
         return (
             [] if self._listener is None else list(self._listener.subentries.values())
         )
 
     def add_box(self, boxes: list[ConfigSubentryData]) -> ConfigFlowResult:
-        """Add a box that has dialled to its listener."""
+        """Add a discovered box to its listener."""
         [box] = boxes
         entries = self.hass.config_entries
         entry = self._listener
@@ -341,38 +341,39 @@ class ListenerSteps(ChargerSteps[ConfigFlowContext, ConfigFlowResult, str], Conf
 
 
 def found_box(serial: str, firmware: str | None) -> FoundCharger:
-    """Return what a box tells that is not set up: who it is, and nothing else."""
+    """Return an unknown box as a search result; it has reported only its identity."""
     info = ChargerInfo(
         manufacturer="P-CHARGE",
         model="EWS-Box",
         serial=serial,
-        # Anybody may have dialled, and texts can have links in them.
+        # Any device can dial and send this text, which must not become a link.
         firmware=re.sub(r"[^\w.-]", "", firmware or "") or None,
     )
     return FoundCharger(address=serial, serial=serial, info=info)
 
 
-def listener_title(data: Mapping[str, Any]) -> str:
-    """Return a listener's name, as long as nobody gave it another."""
-    return f"EWS-Boxes ({address_name(data[CONF_HOST], data[CONF_PORT])})"
+def listener_title(protocol: Protocol, data: Mapping[str, Any]) -> str:
+    """Return the default title of a listener."""
+    address = address_name(data[CONF_HOST], data[CONF_PORT])
+    return f"{protocol.make.plural} ({address})"
 
 
-# -- Who may dial ----------------------------------------------------------------
+# -- Options ---------------------------------------------------------------------
 
 
 class ListenerOptionsFlow(OptionsFlow):
-    """Restrict from which addresses boxes may dial."""
+    """Options of a listener: the addresses from which boxes may dial."""
 
     async def async_step_init(
         self, user_input: dict[str, Any] | None = None
     ) -> ConfigFlowResult:
-        """Ask for addresses and networks; none: all may."""
+        """Ask for addresses and networks; none: any address is allowed."""
         wrong = ""
         if user_input is not None:
             typed = [text.strip() for text in user_input.get(CONF_ALLOWED, ())]
             wrong = next((text for text in typed if text and not _network(text)), "")
             if not wrong:
-                # Each only once, in the order in which they were typed.
+                # Without duplicates, in the order typed.
                 allowed = dict.fromkeys(filter(None, map(_network, typed)))
                 return self.async_create_entry(data={CONF_ALLOWED: list(allowed)})
         form = vol.Schema(
@@ -393,7 +394,7 @@ class ListenerOptionsFlow(OptionsFlow):
 
 
 def _network(text: str) -> str | None:
-    """Return a network, or the address of one machine, as it is stored."""
+    """Return a network or a single address as it is stored; ``None``: invalid."""
     try:
         made = ip_network(text, strict=False)
     except ValueError:

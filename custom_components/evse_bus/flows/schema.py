@@ -1,7 +1,4 @@
-"""The forms for a bus and for the search: asked, refused, stored. Pure.
-
-A form's texts stand in ``translations/en.json``.
-"""
+"""The forms for a bus and for the search, and form fields that others share. Pure."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
@@ -15,16 +12,17 @@ from homeassistant.helpers.selector import (
     NumberSelectorConfig,
     NumberSelectorMode,
     SelectOptionDict,
+    Selector,
     SelectSelector,
     SelectSelectorConfig,
     SelectSelectorMode,
     SerialPortSelector,
+    TextSelector,
 )
 import probatio as vol
 
 from ..const import (
     CONF_BAUDRATE,
-    CONF_COMMAND,
     CONF_FAIL_SAFE_CURRENT,
     CONF_FAIL_SAFE_TIMEOUT,
     CONF_INSTALLATION_LIMIT,
@@ -36,36 +34,28 @@ from ..const import (
 )
 from ..evse.errors import RefusedOrderError
 from ..evse.model import MAXIMUM_CURRENT, MINIMUM_CURRENT
+from ..evse.options import Choice, Option, Quantity, Toggle
+from ..evse.protocols import protocols_by_make
 from ..evse.safety import INTERVALS_PER_TIMEOUT, MAXIMUM_TIMEOUT, number
-from .address import ADDRESSES, Errors
+from .address import Errors, address_field
 
 if TYPE_CHECKING:
     from ..evse.framing import LineSettings
     from ..evse.protocol import Protocol
     from ..evse.scan import FoundCharger
 
-# Keys of the forms that are stored under another name, or not at all.
+# Keys of form fields that are stored under another name, or not at all.
 CONF_LINE: Final = "line"
 CONF_CHARGERS: Final = "chargers"
 CONF_CONFIRM: Final = "confirm"
 CONF_SEARCH_CURRENT: Final = "search_current"
 
 SUGGESTED_LIMIT: Final = 16.0
-"""Offered, never taken unseen: the user confirms what the wiring may carry, A."""
+"""Offered, but not a default: the user confirms the limit of the wiring, A."""
 DEFAULT_FAIL_SAFE_TIMEOUT: Final = 60
-
-MAKES: Final[Mapping[str, tuple[str, ...]]] = {
-    "evbox": ("evbox",),
-    "abl": ("abl",),
-    "smartevse": ("smartevse", "smartevse_master"),
-    "ews": ("ews", "ews_network"),
-}
-"""What people choose first, and the protocols that it can then be."""
-
-COMMANDS: Final = ("68", "69")
-"""EVBox messages; 69 has no serial number, so every box feels spoken to."""
+"""s"""
 SEARCH_CURRENTS: Final = ("0", "6")
-"""What a search may set, A: no more before a box has told its maximum."""
+"""Currents that a search may set, A: no more before a box has reported its maximum."""
 
 
 # -- Fields ----------------------------------------------------------------------
@@ -77,7 +67,7 @@ def amperes(lowest: float = 0) -> NumberSelector:
 
 
 def quantity(lowest: float, highest: float, step: float, unit: str) -> NumberSelector:
-    """Return a field for a number to be typed."""
+    """Return a field for a typed number."""
     return NumberSelector(
         NumberSelectorConfig(
             min=lowest,
@@ -90,7 +80,7 @@ def quantity(lowest: float, highest: float, step: float, unit: str) -> NumberSel
 
 
 def dropdown(key: str, options: Iterable[str]) -> SelectSelector:
-    """Return a field to choose from; its texts stand under ``selector.<key>``."""
+    """Return a list to choose from; its texts are under ``selector.<key>``."""
     return SelectSelector(
         SelectSelectorConfig(
             options=list(options),
@@ -100,17 +90,36 @@ def dropdown(key: str, options: Iterable[str]) -> SelectSelector:
     )
 
 
+def option_field(option: Option) -> Selector[Any]:
+    """Return the field for an option of a protocol."""
+    if isinstance(option, Choice):
+        return dropdown(option.name, option.values)
+    if isinstance(option, Toggle):
+        return BooleanSelector()
+    if isinstance(option, Quantity):
+        return quantity(option.lowest, option.highest, option.step, option.unit)
+    return TextSelector()
+
+
+def option_fields(options: Iterable[Option]) -> dict[vol.Marker, object]:
+    """Return the fields for some options, each with its default."""
+    return {
+        vol.Required(option.name, default=option.default): option_field(option)
+        for option in options
+    }
+
+
 def suggest(key: str, value: object) -> vol.Marker:
-    """Return the key of a field that is filled in, but not taken unseen."""
+    """Return the key of a required field with a suggested value, but no default."""
     return vol.Required(key, description={"suggested_value": value})
 
 
 def default_of(protocol: Protocol, name: str) -> Any:  # noqa: ANN401 - any field's
-    """Return what a protocol sets up a charger with, unless told otherwise."""
+    """Return the default of a field of the protocol's `ChargerConfig`."""
     return next(one.default for one in fields(protocol.config) if one.name == name)
 
 
-# -- Checks that several forms share ---------------------------------------------
+# -- Validation that several forms share -----------------------------------------
 
 
 def is_number(value: object) -> bool:
@@ -126,7 +135,7 @@ def is_number(value: object) -> bool:
 
 
 def check_currents(typed: Mapping[str, Any]) -> Errors:
-    """Return what is wrong with the currents of a form."""
+    """Return the errors in the currents of a form."""
     keys = (CONF_INSTALLATION_LIMIT, CONF_INSTALLATION_LIMIT_2, CONF_FAIL_SAFE_CURRENT)
     errors = {
         key: "not_a_number"
@@ -142,7 +151,7 @@ def check_currents(typed: Mapping[str, Any]) -> Errors:
 
 
 def check_timeout(typed: Mapping[str, Any], poll_interval: float) -> Errors:
-    """Return what is wrong with the fail-safe time-out of a form, if it has one."""
+    """Return the errors in the fail-safe time-out of a form, if it has one."""
     if (timeout := typed.get(CONF_FAIL_SAFE_TIMEOUT)) is None:
         return {}
     if not is_number(timeout):
@@ -156,12 +165,12 @@ def check_timeout(typed: Mapping[str, Any], poll_interval: float) -> Errors:
 
 
 def protocol_form() -> vol.Schema:
-    """Ask which chargers they are."""
+    """Return the form for the make of the chargers."""
     return vol.Schema(
         {
             vol.Required(CONF_PROTOCOL): SelectSelector(
                 SelectSelectorConfig(
-                    options=list(MAKES),
+                    options=list(protocols_by_make()),
                     translation_key=CONF_PROTOCOL,
                     mode=SelectSelectorMode.LIST,
                 )
@@ -171,9 +180,9 @@ def protocol_form() -> vol.Schema:
 
 
 def port_form(usual: LineSettings, more: vol.Schema | None = None) -> vol.Schema:
-    """Ask for the port; experts may say how bytes look on the wire.
+    """Return the form for the port, with the line settings in a collapsed section.
 
-    ``more`` is asked between the two.
+    ``more`` is a form to insert between the two.
     """
     line = {
         vol.Required(CONF_BAUDRATE, default=usual.baudrate): quantity(
@@ -196,7 +205,7 @@ def port_form(usual: LineSettings, more: vol.Schema | None = None) -> vol.Schema
 
 
 def port_suggestions(data: Mapping[str, Any], settings: LineSettings) -> dict[str, Any]:
-    """Return what is stored of a bus as the port form shows it."""
+    """Return the stored data of a bus as values of the port form."""
     return {
         CONF_DEVICE: data[CONF_DEVICE],
         CONF_LINE: {
@@ -208,9 +217,10 @@ def port_suggestions(data: Mapping[str, Any], settings: LineSettings) -> dict[st
 
 
 def bus_data(protocol: Protocol, typed: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an entry's data of a filled-in port form: overrides where they differ.
+    """Return the data of a config entry from a filled-in port form.
 
-    Raises RefusedOrderError for a baud rate that is no number.
+    Line settings are stored only where they differ from those of the protocol. Raises
+    RefusedOrderError for a baud rate that is not a number.
     """
     line = typed[CONF_LINE]
     wanted = {
@@ -234,21 +244,18 @@ def bus_data(protocol: Protocol, typed: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def impose_form(protocol: Protocol, *, ask_addresses: bool) -> vol.Schema:
-    """Ask for all that a search sets, where every message sets limits.
+    """Return the form for the values that a search sets.
 
-    Without addresses everybody is searched: then also those that know only the
-    message without a serial number can be found.
+    Without addresses it reaches every box on the line, and asks for the options that
+    decide how an unknown box is addressed.
     """
-    address = ADDRESSES[protocol.key]
+    form = protocol.address
     first: dict[vol.Marker, object] = {}
     last: dict[vol.Marker, object] = {}
     if ask_addresses:
-        first[vol.Required(address.many)] = address.selector_many
+        first[vol.Required(form.plural)] = address_field(form, multiple=True)
     else:
-        usual = str(default_of(protocol, CONF_COMMAND))
-        last[vol.Required(CONF_COMMAND, default=usual)] = dropdown(
-            CONF_COMMAND, COMMANDS
-        )
+        last |= option_fields(one for one in protocol.options if one.before_search)
     last[vol.Required(CONF_CONFIRM, default=False)] = BooleanSelector()
     return vol.Schema(
         first
@@ -267,7 +274,7 @@ def impose_form(protocol: Protocol, *, ask_addresses: bool) -> vol.Schema:
 
 
 def check_impose(protocol: Protocol, typed: Mapping[str, Any]) -> Errors:
-    """Return what is wrong with the values that a search would set."""
+    """Return the errors in the values that a search would set."""
     errors = check_currents(typed) | check_timeout(
         typed, default_of(protocol, CONF_POLL_INTERVAL)
     )
@@ -277,10 +284,10 @@ def check_impose(protocol: Protocol, typed: Mapping[str, Any]) -> Errors:
 
 
 def found_form(options: list[SelectOptionDict], *, multiple: bool) -> vol.Schema:
-    """Ask which of the chargers found to add.
+    """Return the form for the chargers to add.
 
-    Of several it is also asked what their wiring may carry, once for all; for one
-    alone the next form asks that.
+    If several can be added, it also asks for their installation limit; otherwise the
+    next form does.
     """
     every = [option["value"] for option in options]
     chosen: vol.Marker = (
@@ -301,8 +308,8 @@ def found_form(options: list[SelectOptionDict], *, multiple: bool) -> vol.Schema
 def found_options(
     protocol: Protocol, found: Iterable[FoundCharger]
 ) -> list[SelectOptionDict]:
-    """Return the chargers found as a list to choose from."""
-    show = ADDRESSES[protocol.key].show
+    """Return the chargers found as options to choose from."""
+    show = protocol.address.show
     return [
         SelectOptionDict(
             value=str(one.address),
@@ -314,7 +321,7 @@ def found_options(
 
 
 def model_name(found: FoundCharger) -> str:
-    """Return what a charger found is."""
+    """Return manufacturer, model and firmware of a charger found."""
     info = found.info
     firmware = f", firmware {info.firmware}" if info.firmware else ""
     return f"{info.manufacturer} {info.model}{firmware}"

@@ -1,4 +1,4 @@
-"""Ports tried and buses searched for the config flow, with progress."""
+"""Trying a port and searching a bus, for the flows."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import urlsplit
 
 from ..const import (
-    CONF_COMMAND,
     CONF_FAIL_SAFE_CURRENT,
     CONF_FAIL_SAFE_TIMEOUT,
     CONF_INSTALLATION_LIMIT,
     LOGGER,
 )
+from ..evse.address import NumberAddress
 from ..evse.errors import (
     LineBusyError,
     LineError,
@@ -25,17 +25,17 @@ from ..evse.errors import (
 )
 from ..evse.line import Line
 from ..evse.model import ChargerConfig, CurrentLimit, Orders
-from ..evse.scan import Address, ScanResult
-from .address import ADDRESSES
+from ..evse.scan import ScanResult
 from .schema import CONF_SEARCH_CURRENT
 
 if TYPE_CHECKING:
     from ..evse.bus import Bus
     from ..evse.framing import LineSettings
     from ..evse.protocol import Progress, Protocol
+    from ..evse.scan import Address
 
-type Imposed = tuple[ChargerConfig, Orders]
-"""What a search sets on a charger, where every message sets limits."""
+type Probe = tuple[ChargerConfig, Orders]
+"""Configuration and orders that a search uses; sent where every message sets limits."""
 
 _ERRORS: Final[dict[type[Exception], str]] = {
     PortBusyError: "port_busy",
@@ -47,11 +47,11 @@ _ERRORS: Final[dict[type[Exception], str]] = {
     NotAvailableError: "entry_not_loaded",
     LineError: "cannot_open",
 }
-"""What is said of an error; the first that fits."""
+"""Keys of the error texts; the first class that matches counts."""
 
 
 def error_key(error: Exception) -> str:
-    """Return what a form says of an error; logs one that nobody expected."""
+    """Return the key of the text for an error; logs an unexpected one."""
     for kind, key in _ERRORS.items():
         if isinstance(error, kind):
             if kind is LineError:
@@ -62,7 +62,7 @@ def error_key(error: Exception) -> str:
 
 
 async def async_try_port(url: str, settings: LineSettings) -> str | None:
-    """Open and close a port without sending anything; return what is wrong."""
+    """Open and close a port without sending anything; return the key of the error."""
     line = Line(url, settings)
     try:
         await line.open()
@@ -73,39 +73,43 @@ async def async_try_port(url: str, settings: LineSettings) -> str | None:
 
 
 def is_same_port(one: str, other: str) -> bool:
-    """Return whether two names mean one port; blocks on the file system."""
+    """Return whether two names are those of one port; blocks on the file system."""
     if "://" in one or "://" in other:
         return one == other
     return realpath(one) == realpath(other)
 
 
 def port_name(url: str) -> str:
-    """Return a short name for a port, for titles."""
+    """Return a short name of a port, for titles."""
     if "://" in url:
         return urlsplit(url).netloc or url
     return url.rstrip("/").rsplit("/", 1)[-1]
 
 
-def imposed(
+def probes(
     protocol: Protocol, addresses: Sequence[Address], typed: Mapping[str, Any]
-) -> list[Imposed]:
-    """Return what a search sets, of the values that the user has confirmed."""
+) -> list[Probe]:
+    """Return the probes for some addresses, with the values confirmed by the user."""
     fail_safe = CurrentLimit(current=typed[CONF_FAIL_SAFE_CURRENT])
     orders = Orders(
         limit=CurrentLimit(current=float(typed[CONF_SEARCH_CURRENT])),
         fail_safe=fail_safe,
         fail_safe_timeout=int(typed[CONF_FAIL_SAFE_TIMEOUT]),
     )
-    more = {CONF_INSTALLATION_LIMIT: typed[CONF_INSTALLATION_LIMIT]}
-    if CONF_COMMAND in typed:
-        more[CONF_COMMAND] = int(typed[CONF_COMMAND])
+    more = {CONF_INSTALLATION_LIMIT: typed[CONF_INSTALLATION_LIMIT]} | {
+        option.name: option.load(option.store(typed[option.name]))
+        for option in protocol.options
+        if option.name in typed
+    }
     return [(_config(protocol, int(address), more), orders) for address in addresses]
 
 
-def nothing_imposed(protocol: Protocol) -> list[Imposed]:
-    """Return what the search of a protocol that only reads is called with."""
-    config = _config(protocol, ADDRESSES[protocol.key].lowest, {})
-    return [(config, Orders(limit=CurrentLimit(current=0.0)))]
+def read_only_probe(protocol: Protocol) -> Probe:
+    """Return the probe of a protocol whose search only reads."""
+    form = protocol.address
+    # Only a valid address is needed; the first port where addresses are no numbers.
+    address = form.lowest if isinstance(form, NumberAddress) else 1
+    return _config(protocol, address, {}), Orders(limit=CurrentLimit(current=0.0))
 
 
 def _config(protocol: Protocol, address: int, more: Mapping[str, Any]) -> ChargerConfig:
@@ -116,22 +120,22 @@ def _config(protocol: Protocol, address: int, more: Mapping[str, Any]) -> Charge
 
 
 async def async_search(
-    protocol: Protocol, bus: Bus, searches: Sequence[Imposed], progress: Progress
+    protocol: Protocol, bus: Bus, searches: Sequence[Probe], progress: Progress
 ) -> ScanResult:
-    """Search a started bus, once for each set of values; return all that was found.
+    """Search a started bus with each probe in turn; return the results as one.
 
-    Raises LineError and what else the bus raises.
+    Raises LineError, and what `Protocol.scan` raises.
     """
-    reports: list[ScanResult] = []
+    results: list[ScanResult] = []
     for config, orders in searches:
-        share = partial(_share, progress, len(reports), len(searches))
-        reports.append(await protocol.scan(bus, config, orders, share))
+        share = partial(_share, progress, len(results), len(searches))
+        results.append(await protocol.scan(bus, config, orders, share))
     return ScanResult(
-        found=tuple(one for report in reports for one in report.found),
-        duplicates=tuple(one for report in reports for one in report.duplicates),
-        unreadable=any(report.unreadable for report in reports),
-        unsupported=tuple(one for report in reports for one in report.unsupported),
-        other_master=any(report.other_master for report in reports),
+        found=tuple(one for result in results for one in result.found),
+        duplicates=tuple(one for result in results for one in result.duplicates),
+        unreadable=any(result.unreadable for result in results),
+        unsupported=tuple(one for result in results for one in result.unsupported),
+        other_master=any(result.other_master for result in results),
     )
 
 

@@ -1,23 +1,20 @@
-"""Steps that adding a bus and adding a charger share: search, name, confirm."""
+"""Flow steps common to adding a bus and adding a charger: search, name, confirm."""
 
 from abc import abstractmethod
 import asyncio
-from collections.abc import Iterable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from homeassistant.config_entries import ConfigSubentry, ConfigSubentryData
 from homeassistant.const import CONF_ADDRESS, CONF_NAME
 from homeassistant.data_entry_flow import FlowContext, FlowHandler, FlowResult
 
-from ..configuration import charger_unique_id, line_settings
+from ..configuration import line_settings
 from ..connections import connection_name
-from ..const import (
-    CONF_INSTALLATION_LIMIT,
-    SUBENTRY_CHARGER,
-)
-from ..discovery import box_unique_id, is_set_up
+from ..const import CONF_INSTALLATION_LIMIT, SUBENTRY_CHARGER
+from ..discovery import is_set_up
 from ..evse.scan import Address, ScanResult
-from .address import ADDRESSES, Errors, manual_form, typed_addresses
+from .address import Errors, manual_form, typed_addresses
 from .charger import (
     Candidate,
     charger_data,
@@ -42,48 +39,60 @@ if TYPE_CHECKING:
     from ..evse.scan import FoundCharger
 
 
+type Step[ResultT] = Callable[[dict[str, Any] | None], Awaitable[ResultT]]
+"""A step of a flow: takes the filled-in form, if any."""
+
+
 class ChargerSteps[
     ContextT: FlowContext,
     ResultT: FlowResult[Any, Any],
     HandlerT,
 ](FlowHandler[ContextT, ResultT, HandlerT]):
-    """From a bus to chargers that are ready to be stored."""
+    """Steps from a bus to the data of its new chargers."""
 
-    at_once: ClassVar[bool]
-    """More than one charger can be added at once."""
+    adds_several: ClassVar[bool]
+    """Several chargers can be added in one flow."""
     step_after_error: ClassVar[str]
-    """Where one goes when it could not be made; shows `take_error`."""
+    """Step after a failed search; it shows `take_error`."""
 
     def __init__(self) -> None:
-        """Start with nothing found."""
+        """Start without chargers."""
         super().__init__()
         self.protocol: Protocol
         self.bus_data: dict[str, Any]
-        """Data of the bus's entry."""
+        """Data of the config entry of the bus."""
         self.ready: list[ConfigSubentryData] = []
         self.suggestions: dict[str, Any] = {}
-        """Values typed so far that the next forms offer again."""
+        """Values typed so far that the next forms suggest."""
         self._scan_task: asyncio.Task[ScanResult] | None = None
-        self._report = ScanResult()
+        self._result = ScanResult()
         self._error: str | None = None
         self._pending: list[Candidate] = []
 
-    # -- What the two flows do differently ---------------------------------------
+    def add_step(self, step_id: str, step: Step[ResultT]) -> str:
+        """Add a step whose texts are those of one protocol; return its id.
+
+        The flow manager finds a step by the name of its method.
+        """
+        setattr(self, f"async_step_{step_id}", step)
+        return step_id
+
+    # -- Differences between the two flows ---------------------------------------
 
     @abstractmethod
     async def async_scan(self, progress: Progress) -> ScanResult:
-        """Search the bus; leave no port open that was not open before."""
+        """Search the bus; leave a port closed that was closed before."""
 
     @abstractmethod
     def finish(self, chargers: list[ConfigSubentryData]) -> ResultT:
-        """Store the chargers."""
+        """Store the chargers and end the flow."""
 
     def choices(self) -> tuple[str, ...]:
-        """Return where one can go when a search brought nothing to add."""
+        """Return the steps to offer when a search has found nothing to add."""
         return ("scan", "manual")
 
     def others(self) -> list[ConfigSubentry]:
-        """Return the chargers that the bus has already."""
+        """Return the other chargers of the bus."""
         return []
 
     def taken(self) -> set[Address]:
@@ -91,13 +100,13 @@ class ChargerSteps[
         return {one.data[CONF_ADDRESS] for one in self.others()}
 
     def waiting(self) -> list[str]:
-        """Return the addresses of those that have dialled and wait to be added."""
+        """Return the addresses of unknown boxes that are connected."""
         return []
 
     @property
     def several(self) -> bool:
-        """Return whether more than one charger can be added now."""
-        return self.at_once and not ADDRESSES[self.protocol.key].alone
+        """Return whether several chargers can be added now."""
+        return self.adds_several and not self.protocol.address.single
 
     # -- Search ------------------------------------------------------------------
 
@@ -105,11 +114,10 @@ class ChargerSteps[
         self,
         user_input: dict[str, Any] | None = None,  # noqa: ARG002 - a step's signature
     ) -> ResultT:
-        """Search, and show how far it is."""
+        """Search, and show the progress."""
         if self._scan_task is None:
-            # The flow manager cancels it when the flow is closed.
-            # It must not be over at once: the manager would hand what was typed
-            # last to the step that comes after the search.
+            # The flow manager cancels it when the flow is closed. It must not end
+            # at once: the manager would pass the last form to the step that follows.
             self._scan_task = self.hass.async_create_background_task(
                 self.async_scan(self.async_update_progress),
                 "evse_bus search",
@@ -126,28 +134,28 @@ class ChargerSteps[
         if isinstance(error := task.exception(), Exception):
             self._error = error_key(error)
             return self.async_show_progress_done(next_step_id=self.step_after_error)
-        self._report = task.result()
+        self._result = task.result()
         return self.async_show_progress_done(next_step_id=self._step_after_scan())
 
     def _step_after_scan(self) -> str:
-        if self._report.other_master:
+        if self._result.other_master:
             return "other_master"
-        if self._report.duplicates:
+        if self._result.duplicates:
             return "duplicates"
-        if self._report.unsupported:
+        if self._result.unsupported:
             return "unsupported"
         if self._new():
             return "select"
-        if self._report.found:
+        if self._result.found:
             return "nothing_new"
-        return "unreadable" if self._report.unreadable else "nothing_found"
+        return "unreadable" if self._result.unreadable else "nothing_found"
 
     def _new(self) -> list[FoundCharger]:
         taken = self.taken()
-        return [one for one in self._report.found if one.address not in taken]
+        return [one for one in self._result.found if one.address not in taken]
 
     def take_error(self) -> Errors:
-        """Return what went wrong before this form, once."""
+        """Return the error of the step before this form, once."""
         error, self._error = self._error, None
         return {"base": error} if error else {}
 
@@ -155,30 +163,30 @@ class ChargerSteps[
         self,
         user_input: dict[str, Any] | None = None,  # noqa: ARG002
     ) -> ResultT:
-        """Say that nobody answered, and what to try."""
+        """Report that no charger answered, and offer what to try."""
         return self._menu("nothing_found")
 
     async def async_step_nothing_new(
         self,
         user_input: dict[str, Any] | None = None,  # noqa: ARG002
     ) -> ResultT:
-        """Say that only chargers answered that are there already."""
+        """Report that only chargers answered that are set up already."""
         return self._menu("nothing_new")
 
     async def async_step_unreadable(
         self,
         user_input: dict[str, Any] | None = None,  # noqa: ARG002
     ) -> ResultT:
-        """Say that something answered that makes no sense."""
+        """Report that no frame could be made of the bytes received."""
         return self._menu("unreadable")
 
     async def async_step_duplicates(
         self,
         user_input: dict[str, Any] | None = None,  # noqa: ARG002
     ) -> ResultT:
-        """Say that several chargers answer at one address."""
-        show = ADDRESSES[self.protocol.key].show
-        addresses = ", ".join(show(one) for one in self._report.duplicates)
+        """Report that several chargers answer at one address."""
+        show = self.protocol.address.show
+        addresses = ", ".join(show(one) for one in self._result.duplicates)
         first = ("select",) if self._new() else ()
         return self._menu("duplicates", first, addresses=addresses)
 
@@ -186,11 +194,11 @@ class ChargerSteps[
         self,
         user_input: dict[str, Any] | None = None,  # noqa: ARG002
     ) -> ResultT:
-        """Say that chargers answered whose firmware cannot be used like this."""
-        show = ADDRESSES[self.protocol.key].show
+        """Report chargers whose firmware this protocol does not support."""
+        show = self.protocol.address.show
         chargers = "\n".join(
             f"- {show(one.address)}: {model_name(one)}"
-            for one in self._report.unsupported
+            for one in self._result.unsupported
         )
         first = ("select",) if self._new() else ()
         return self._menu("unsupported", first, chargers=chargers)
@@ -199,7 +207,7 @@ class ChargerSteps[
         self,
         user_input: dict[str, Any] | None = None,  # noqa: ARG002
     ) -> ResultT:
-        """Say that there is a master already, so that we must be silent."""
+        """Report another master on the line; Home Assistant must be silent."""
         return self._menu("other_master")
 
     def _menu(
@@ -212,7 +220,7 @@ class ChargerSteps[
         )
 
     def placeholders(self) -> dict[str, str]:
-        """Return what texts may name of the bus."""
+        """Return the placeholders of the bus for texts."""
         return {
             "port": connection_name(self.bus_data),
             "protocol": self.protocol.name,
@@ -224,7 +232,7 @@ class ChargerSteps[
     async def async_step_select(
         self, user_input: dict[str, Any] | None = None
     ) -> ResultT:
-        """Choose from what was found."""
+        """Choose from the chargers found."""
         found = self._new()
         errors: Errors = {}
         if user_input is not None:
@@ -255,26 +263,26 @@ class ChargerSteps[
     async def async_step_manual(
         self, user_input: dict[str, Any] | None = None
     ) -> ResultT:
-        """Type where the chargers are."""
+        """Type the addresses of the chargers."""
         errors = self.take_error()
-        form = ADDRESSES[self.protocol.key]
+        form = self.protocol.address
         if form.optional and form.any is not None:
-            # There is one on such a line: the form for the charger asks the rest.
+            # One box on the line: its form asks for the serial number.
             return await self.async_begin([Candidate(address=form.any)])
         if user_input is not None:
-            addresses, errors = typed_addresses(self.protocol, user_input, self.taken())
+            addresses, errors = typed_addresses(form, user_input, self.taken())
             if any(self.is_elsewhere(one) for one in addresses):
-                errors[form.one] = "box_already_set_up"
+                errors[form.key] = "box_already_set_up"
             if not errors:
-                told = {one.address: one for one in self._report.found}
+                found = {one.address: one for one in self._result.found}
                 return await self.async_begin(
-                    Candidate(address=address, found=told.get(address))
+                    Candidate(address=address, found=found.get(address))
                     for address in addresses
                 )
         return self.async_show_form(
             step_id="manual",
             data_schema=self.add_suggested_values_to_schema(
-                manual_form(self.protocol, multiple=self.several, known=self.waiting()),
+                manual_form(form, multiple=self.several, known=self.waiting()),
                 user_input,
             ),
             errors=errors,
@@ -284,7 +292,7 @@ class ChargerSteps[
     # -- One charger after the other ---------------------------------------------
 
     async def async_begin(self, candidates: Iterable[Candidate]) -> ResultT:
-        """Ask for the first charger's name and limits."""
+        """Begin with the form for the first charger."""
         self._pending = list(candidates)
         self.ready = []
         return await self.async_step_charger()
@@ -292,7 +300,7 @@ class ChargerSteps[
     async def async_step_charger(
         self, user_input: dict[str, Any] | None = None
     ) -> ResultT:
-        """Ask for one charger's name and limits; again for the next."""
+        """Ask for the name and limits of one charger after the other."""
         errors: Errors = {}
         if user_input is not None:
             errors = self._take_charger(self._pending[0], user_input)
@@ -300,13 +308,13 @@ class ChargerSteps[
                 self._pending.pop(0)
                 user_input = None
                 if not self._pending:
-                    return self.confirm()
+                    return await self._async_confirm()
         candidate = self._pending[0]
-        address = ADDRESSES[self.protocol.key]
+        address = self.protocol.address
         limit = self.suggestions.get(CONF_INSTALLATION_LIMIT, SUGGESTED_LIMIT)
         offered = {
             CONF_NAME: default_name(self.protocol, candidate.address),
-            address.one: address.show(candidate.address),
+            address.key: address.show(candidate.address),
             **self.suggestions,
             **candidate.suggestions(self.protocol, limit),
         }
@@ -328,36 +336,38 @@ class ChargerSteps[
         )
 
     async def async_step_box(self, user_input: dict[str, Any] | None = None) -> ResultT:
-        """Ask the same for a box with ports of its own: it has texts of its own."""
+        """Ask the same for a box with several ports, with texts of its own."""
         return await self.async_step_charger(user_input)
 
     def is_elsewhere(self, address: Address, but: ConfigSubentry | None = None) -> bool:
-        """Return whether a box, which can be connected in two ways, is set up in one.
+        """Return whether a box is set up already, by any protocol of its family.
 
-        ``but``: the one that is being changed.
+        ``but`` is the subentry being reconfigured.
         """
-        serial = ADDRESSES[self.protocol.key].serial(address)
+        protocol = self.protocol
+        serial = protocol.address.serial(address)
         return (
-            self.protocol.ports > 1
+            protocol.serial_family is not None
             and serial is not None
-            and is_set_up(self.hass, box_unique_id(serial), but)
+            and is_set_up(self.hass, protocol.unique_id(serial), but)
         )
 
     def _take_charger(self, candidate: Candidate, typed: dict[str, Any]) -> Errors:
         others = self.others()
-        # Of those that are still to come nothing is known, but they will be there.
+        # Nothing is known yet of the chargers that follow, but they count.
         expected: list[Mapping[str, Any]] = [one.data for one in others]
         expected += [one["data"] for one in self.ready]
         expected += [{} for _ in self._pending[1:]]
-        errors = check_charger(typed, expected)
-        if ADDRESSES[self.protocol.key].one in typed:
-            # Found without its serial number: here it can be given.
-            addresses, wrong = typed_addresses(self.protocol, typed, self.taken())
+        errors = check_charger(self.protocol, typed, expected)
+        form = self.protocol.address
+        if form.key in typed:
+            # Found without its serial number, which can be typed here.
+            addresses, wrong = typed_addresses(form, typed, self.taken())
             errors |= wrong
             if addresses:
                 candidate = Candidate(address=addresses[0])
         serial = candidate.serial(self.protocol)
-        identity = charger_unique_id(self.protocol.key, serial, candidate.address)
+        identity = self.protocol.unique_id(serial, candidate.address)
         if identity in {one.unique_id for one in others}:
             errors["base"] = "already_configured"
         if self.is_elsewhere(candidate.address):
@@ -365,7 +375,7 @@ class ChargerSteps[
         if not errors:
             self.ready.append(
                 ConfigSubentryData(
-                    data=charger_data(candidate.address, serial, typed),
+                    data=charger_data(self.protocol, candidate.address, serial, typed),
                     subentry_type=SUBENTRY_CHARGER,
                     title=typed[CONF_NAME].strip(),
                     unique_id=identity,
@@ -373,53 +383,17 @@ class ChargerSteps[
             )
         return errors
 
-    # -- Confirm: each protocol explains its own fail-safe ------------------------
+    # -- Confirm -----------------------------------------------------------------
 
-    def confirm(self, user_input: dict[str, Any] | None = None) -> ResultT:
-        """Show what will be stored, or store it now that it is confirmed."""
-        # A page that is loaded again asks for the step without having confirmed.
+    async def _async_confirm(self, user_input: dict[str, Any] | None = None) -> ResultT:
+        """Show the summary, with the protocol's own fail-safe; then store."""
+        # A reloaded page asks for the step without having confirmed it.
         if user_input is not None:
             return self.finish(self.ready)
         rows = (confirm_row(self.protocol, one) for one in self.ready)
         return self.async_show_form(
-            step_id=f"confirm_{self.protocol.key}",
+            step_id=self.add_step(f"confirm_{self.protocol.key}", self._async_confirm),
             description_placeholders=supply_texts(self.bus_data)
             | {"chargers": "\n".join(rows)},
             last_step=True,
         )
-
-    async def async_step_confirm_evbox(
-        self, user_input: dict[str, Any] | None = None
-    ) -> ResultT:
-        """Store, now that the user knows an EVBox's fail-safe."""
-        return self.confirm(user_input)
-
-    async def async_step_confirm_abl(
-        self, user_input: dict[str, Any] | None = None
-    ) -> ResultT:
-        """Store, now that the user knows that an ABL box has none."""
-        return self.confirm(user_input)
-
-    async def async_step_confirm_smartevse(
-        self, user_input: dict[str, Any] | None = None
-    ) -> ResultT:
-        """Store, now that the user knows that a polled SmartEVSE has none."""
-        return self.confirm(user_input)
-
-    async def async_step_confirm_smartevse_master(
-        self, user_input: dict[str, Any] | None = None
-    ) -> ResultT:
-        """Store, now that the user knows that slaves stop without us."""
-        return self.confirm(user_input)
-
-    async def async_step_confirm_ews(
-        self, user_input: dict[str, Any] | None = None
-    ) -> ResultT:
-        """Store, now that the user knows what an EWS-Box does without its server."""
-        return self.confirm(user_input)
-
-    async def async_step_confirm_ews_network(
-        self, user_input: dict[str, Any] | None = None
-    ) -> ResultT:
-        """Store, now that the user knows what it does when it cannot dial."""
-        return self.confirm(user_input)

@@ -1,4 +1,4 @@
-"""Add one charger to a bus that is set up, or change its set-up."""
+"""Flow of a subentry: add a charger to a bus, or reconfigure it."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, override
@@ -13,7 +13,7 @@ from homeassistant.config_entries import (
 )
 from homeassistant.const import CONF_ADDRESS, CONF_NAME
 
-from ..configuration import charger_unique_id, protocol_of
+from ..configuration import protocol_of
 from ..connections import Connections, ListenerConnections
 from ..const import (
     CONF_FAIL_SAFE_CURRENT,
@@ -24,7 +24,7 @@ from ..const import (
 )
 from ..evse.errors import NotAvailableError
 from ..evse.scan import Address, ScanResult
-from .address import ADDRESSES, Errors, typed_addresses
+from .address import Errors, typed_addresses
 from .charger import (
     charger_data,
     charger_form,
@@ -32,7 +32,7 @@ from .charger import (
     check_charger,
 )
 from .listener import found_box
-from .search import async_search, nothing_imposed
+from .search import async_search, read_only_probe
 from .steps import ChargerSteps
 
 if TYPE_CHECKING:
@@ -44,9 +44,9 @@ class ChargerSubentryFlow(
     ChargerSteps[SubentryFlowContext, SubentryFlowResult, tuple[str, str]],
     ConfigSubentryFlow,
 ):
-    """Add or change one charger."""
+    """Flow that adds or reconfigures one charger."""
 
-    at_once = False
+    adds_several = False
     step_after_error = "manual"
 
     @override
@@ -69,8 +69,7 @@ class ChargerSubentryFlow(
         self.bus_data = dict(entry.data)
         if self._is_full():
             return self.async_abort(reason=self._full_reason)
-        # A search that sets limits is left to the charger's own first turn; and
-        # the address that every box answers to is not for a bus with others on it.
+        # A search that sets limits would reach the running chargers, too.
         searchable = not (self.protocol.probe_sets_limits or self.protocol.dials_in)
         if not searchable or entry.state is not ConfigEntryState.LOADED:
             return await self.async_step_manual()
@@ -82,14 +81,14 @@ class ChargerSubentryFlow(
 
     @property
     def _full_reason(self) -> str:
-        return "one_ews_box" if self.protocol.key == "ews" else "one_box"
+        return f"one_{self.protocol.make.key}"
 
     def _is_full(self) -> bool:
         """Return whether no further charger can be on this bus."""
-        return ADDRESSES[self.protocol.key].alone and bool(self.others())
+        return self.protocol.address.single and bool(self.others())
 
-    def _lines(self) -> Connections | None:
-        """Return the lines of the bus; ``None``: it is not set up now."""
+    def _connections(self) -> Connections | None:
+        """Return the connections of the bus; ``None``: it is not loaded."""
         entry: EvseBusConfigEntry = self._get_entry()
         if entry.state is not ConfigEntryState.LOADED:
             return None
@@ -97,30 +96,31 @@ class ChargerSubentryFlow(
 
     @override
     def waiting(self) -> list[str]:
-        """Return the serial numbers of boxes that have dialled and are not set up."""
-        lines = self._lines()
-        if not isinstance(lines, ListenerConnections):
+        """Return the serial numbers of unknown boxes that are connected."""
+        connections = self._connections()
+        if not isinstance(connections, ListenerConnections):
             return []
-        strangers = lines.listener.strangers
-        self._report = ScanResult(
+        strangers = connections.listener.strangers
+        self._result = ScanResult(
             found=tuple(found_box(one.serial, one.firmware) for one in strangers)
         )
         return [one.serial for one in strangers]
 
     @override
     async def async_scan(self, progress: Progress) -> ScanResult:
-        """Search between the turns of the chargers that are running."""
-        lines = self._lines()
-        if lines is None or lines.shared_bus is None:
+        """Search between the turns of the running chargers."""
+        connections = self._connections()
+        if connections is None or connections.shared_bus is None:
             raise NotAvailableError(self._get_entry().title)
-        searches = nothing_imposed(self.protocol)
-        return await async_search(self.protocol, lines.shared_bus, searches, progress)
+        probe = read_only_probe(self.protocol)
+        bus = connections.shared_bus
+        return await async_search(self.protocol, bus, [probe], progress)
 
     @override
     def finish(self, chargers: list[ConfigSubentryData]) -> SubentryFlowResult:
         """Create the charger."""
         [charger] = chargers
-        # Another dialogue may have been quicker.
+        # Another flow may have added it in the meantime.
         if self._is_full():
             return self.async_abort(reason=self._full_reason)
         if charger["data"][CONF_ADDRESS] in self.taken():
@@ -136,25 +136,28 @@ class ChargerSubentryFlow(
     async def async_step_reconfigure(
         self, user_input: dict[str, Any] | None = None
     ) -> SubentryFlowResult:
-        """Change a charger's set-up, or where and who it is."""
+        """Change the configuration of a charger, its address or serial number."""
         entry = self._get_entry()
         subentry = self._get_reconfigure_subentry()
         self.protocol = protocol_of(entry.data)
         errors: Errors = {}
         if user_input is not None:
-            addresses, errors = typed_addresses(self.protocol, user_input, self.taken())
+            form = self.protocol.address
+            addresses, errors = typed_addresses(form, user_input, self.taken())
             others = self.others()
-            errors |= check_charger(user_input, [one.data for one in others])
+            errors |= check_charger(
+                self.protocol, user_input, [one.data for one in others]
+            )
             if not errors:
                 [address] = addresses
                 serial = self._serial(address, user_input)
-                identity = charger_unique_id(self.protocol.key, serial, address)
+                identity = self.protocol.unique_id(serial, address)
                 if identity in {one.unique_id for one in others}:
                     errors["base"] = "already_configured"
                 elif self.is_elsewhere(address, but=subentry):
                     errors["base"] = "box_already_set_up"
                 else:
-                    data = charger_data(address, serial, user_input)
+                    data = charger_data(self.protocol, address, serial, user_input)
                     return self.async_update_and_abort(
                         entry,
                         subentry,
@@ -175,18 +178,18 @@ class ChargerSubentryFlow(
     async def async_step_reconfigure_box(
         self, user_input: dict[str, Any] | None = None
     ) -> SubentryFlowResult:
-        """Change the same of a box with ports of its own: it has texts of its own."""
+        """Change the same of a box with several ports, with texts of its own."""
         return await self.async_step_reconfigure(user_input)
 
     def _serial(self, address: Address, typed: dict[str, Any]) -> str | None:
-        form = ADDRESSES[self.protocol.key]
+        form = self.protocol.address
         if form.is_serial:
             return form.serial(address)
         return typed.get(CONF_SERIAL, "").strip() or None
 
 
 def _fail_safe(stored: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fail-safe values first confirmed, within the new limit."""
+    """Return the fail-safe values of the first form, within the new limit."""
     kept = {
         CONF_FAIL_SAFE_CURRENT: min(
             stored[CONF_FAIL_SAFE_CURRENT], new[CONF_INSTALLATION_LIMIT]

@@ -1,4 +1,4 @@
-"""What the chargers of a bus share, where Home Assistant is their master. Pure."""
+"""The form for the shared supply, where Home Assistant is the master. Pure."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Final
 import probatio as vol
 
 from ..const import CONF_SUPPLY_LIMIT, CONF_SUPPLY_MINIMUM
-from ..evse.model import MAXIMUM_CURRENT, MINIMUM_CURRENT
+from ..evse.model import MINIMUM_CURRENT
 from .schema import is_number, quantity, suggest
 
 if TYPE_CHECKING:
@@ -14,31 +14,28 @@ if TYPE_CHECKING:
     from .address import Errors
 
 SUGGESTED_SUPPLY: Final = 16.0
-"""The smallest usual circuit for chargers; taken only once it was confirmed, A."""
-HIGHEST_SUPPLY: Final = 3 * MAXIMUM_CURRENT
-"""More than this three boxes cannot take, A."""
-HIGHEST_MINIMUM: Final = 16.0
-"""As in the menu of a SmartEVSE (MIN), A."""
+"""The smallest usual circuit for chargers; not a default, the user confirms it, A."""
 
 
 def supply_form(protocol: Protocol) -> vol.Schema:
-    """Ask what all chargers share; nothing, where each is on its own."""
-    if protocol.master is None:
+    """Return the form for the shared supply; empty where chargers share none."""
+    supply = protocol.supply
+    if supply is None:
         return vol.Schema({})
     return vol.Schema(
         {
             suggest(CONF_SUPPLY_LIMIT, SUGGESTED_SUPPLY): quantity(
-                MINIMUM_CURRENT, HIGHEST_SUPPLY, 0.1, "A"
+                MINIMUM_CURRENT, supply.highest, 0.1, "A"
             ),
             vol.Required(CONF_SUPPLY_MINIMUM, default=MINIMUM_CURRENT): quantity(
-                MINIMUM_CURRENT, HIGHEST_MINIMUM, 0.1, "A"
+                MINIMUM_CURRENT, supply.highest_minimum, 0.1, "A"
             ),
         }
     )
 
 
 def check_supply(typed: Mapping[str, Any]) -> Errors:
-    """Return what is wrong with the shared supply of a form, if it asks for it."""
+    """Return the errors in the shared supply of a form, if it has one."""
     keys = (CONF_SUPPLY_LIMIT, CONF_SUPPLY_MINIMUM)
     errors = {
         key: "not_a_number"
@@ -53,7 +50,7 @@ def check_supply(typed: Mapping[str, Any]) -> Errors:
 
 
 def supply_data(values: Mapping[str, Any]) -> dict[str, float]:
-    """Return the shared supply, of a checked form or of an entry's data."""
+    """Return the shared supply from a checked form or from a config entry's data."""
     return {
         key: float(values[key])
         for key in (CONF_SUPPLY_LIMIT, CONF_SUPPLY_MINIMUM)
@@ -62,5 +59,5 @@ def supply_data(values: Mapping[str, Any]) -> dict[str, float]:
 
 
 def supply_texts(data: Mapping[str, Any]) -> dict[str, str]:
-    """Return the shared supply for the texts."""
+    """Return the shared supply as placeholders for texts."""
     return {key: f"{value:g}" for key, value in supply_data(data).items()}

@@ -1,23 +1,46 @@
 """ABL EVCC2/3 (eMH1, eMH2, eMH3 wallboxes): Modbus ASCII on RS-485."""
 
+from itertools import permutations
+import re
 from typing import Final
 
+from ..address import NumberAddress
 from ..framing import LineSettings
 from ..modbus import AsciiFramer
-from ..protocol import Protocol
+from ..options import Choice
+from ..protocol import Make, Protocol
+from ..redaction import SerialNumbers
 from .charger import AblCharger
 from .config import TIMING, AblConfig
 from .scan import scan
 
+_PHASE_ORDER: Final = Choice(
+    name="phase_order",
+    default="123",
+    values={"".join(map(str, one)): [*one] for one in permutations((1, 2, 3))},
+    value=tuple,
+)
+
+_SERIALS: Final = SerialNumbers(
+    encode=lambda serial: serial.encode().hex().upper().encode(),
+    # The answer to a read of register 0x50, whose first byte repeats the 50.
+    in_frame=re.compile(rb"(?<=03[0-9A-F]{2}50)[0-9A-F]+"),
+    in_rest=re.compile(rb"\A[0-9A-F]+"),
+)
+
 PROTOCOL: Final = Protocol(
     key="abl",
     name="ABL EVCC2/3",
+    make=Make(key="abl", name="ABL"),
     settings=LineSettings(baudrate=38400, parity="E"),
     timing=TIMING,
     framer=AsciiFramer,
     config=AblConfig,
     charger=AblCharger,
     scan=scan,
+    address=NumberAddress(key="device_id", lowest=1, highest=16),
+    options=(_PHASE_ORDER,),
+    serials=_SERIALS,
 )
 
 __all__ = ["PROTOCOL", "AblCharger", "AblConfig"]

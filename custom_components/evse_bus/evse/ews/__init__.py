@@ -3,7 +3,9 @@
 from dataclasses import replace
 from typing import Final
 
-from ..protocol import Protocol
+from ..address import TextAddress
+from ..protocol import Make, Protocol
+from ..redaction import SerialNumbers
 from .box import Ports
 from .charger import EwsPort
 from .config import EwsPortConfig
@@ -12,9 +14,13 @@ from .scan import scan
 from .timing import SETTINGS, TCP_TIMING, TIMING
 from .wire.frames import EwsFramer
 
+_SERIAL: Final = TextAddress(key="box_serial", longest=12, is_serial=True)
+
 PROTOCOL: Final = Protocol(
     key="ews",
     name="P-CHARGE EWS-Box",
+    make=Make(key="ews", name="EWS-Box", plural="EWS-Boxes", menu="connection"),
+    choice="ews_serial",
     settings=SETTINGS,
     timing=TIMING,
     framer=EwsFramer,
@@ -23,6 +29,13 @@ PROTOCOL: Final = Protocol(
     scan=scan,
     ports=2,
     group=Ports,
+    interface="RS-232",
+    address=replace(_SERIAL, any="", optional=True, single=True),
+    asks_voltage=False,
+    sets_clock=True,
+    # The frames that contain it (``rs``) are not kept: they contain cards, too.
+    serials=SerialNumbers(),
+    serial_family="ews",
 )
 """On RS-232."""
 
@@ -30,6 +43,8 @@ NETWORK: Final = replace(
     PROTOCOL,
     key="ews_network",
     name="P-CHARGE EWS-Box, network",
+    choice="ews_network",
+    address=_SERIAL,
     timing=TCP_TIMING,
     dials_in=True,
 )

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from datetime import tzinfo
+from typing import ClassVar
 
 from ..model import ChargerConfig
 from .wire.commands import PORTS
@@ -13,6 +14,8 @@ class EwsPortConfig(ChargerConfig):
 
     Raises ValueError for another number.
     """
+
+    live: ClassVar = ChargerConfig.live | {"time_zone"}
 
     poll_interval: float = 2.0
     """s; the manual's own proposal (3.2.3). The box hangs up after 30 s of silence."""

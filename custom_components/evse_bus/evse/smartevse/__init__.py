@@ -1,10 +1,15 @@
 """SmartEVSE v2: Modbus RTU on RS-485, polled or with us as load-balancing master."""
 
+import re
 from typing import Final
 
+from ..address import NumberAddress
 from ..framing import LineSettings
 from ..modbus import RtuFramer
-from ..protocol import Protocol
+from ..model import MAXIMUM_CURRENT
+from ..options import Toggle
+from ..protocol import Make, Protocol, SupplyRange
+from ..redaction import SerialNumbers
 from .charger import PolledSmartEvse
 from .config import PolledConfig, SlaveConfig
 from .master import Master
@@ -15,20 +20,47 @@ from .timing import TIMING
 
 SETTINGS: Final = LineSettings(baudrate=9600)
 
+_MAKE: Final = Make(key="smartevse", name="SmartEVSE", menu="mode")
+
+_WORD: Final = 0xFFFF
+
+
+def _word(serial: str) -> bytes:
+    """Return a serial number as a register; empty for one that is no register."""
+    number = int(serial) if serial.isdecimal() else 0
+    return number.to_bytes(2, "big") if 0 < number <= _WORD else b""
+
+
+_SERIALS: Final = SerialNumbers(
+    encode=_word,
+    # Later dialects: the last of twelve registers, and the checksum, which reveals it.
+    in_frame=re.compile(rb"(?s)(?<=\A.\x04\x18.{22}).{1,4}"),
+    distinct=False,
+)
+
 POLLED: Final = Protocol(
     key="smartevse",
     name="SmartEVSE v2",
+    make=_MAKE,
+    choice="polled",
     settings=SETTINGS,
     timing=TIMING,
     framer=RtuFramer,
     config=PolledConfig,
     charger=PolledSmartEvse,
     scan=scan,
+    # Its setting LOAD BAL, as an address: 0 is Disabled, 1 is Master.
+    address=NumberAddress(key="unit", lowest=0, highest=1, labelled=True, single=True),
+    options=(Toggle(name="stop_on_shutdown", prominent=True),),
+    lifetime_is_fail_safe=True,
+    serials=_SERIALS,
 )
 
 MASTER: Final = Protocol(
     key="smartevse_master",
     name="SmartEVSE v2, load balancing",
+    make=_MAKE,
+    choice="master",
     settings=SETTINGS,
     timing=TIMING,
     framer=RtuFramer,
@@ -36,6 +68,12 @@ MASTER: Final = Protocol(
     charger=SlaveSmartEvse,
     scan=master_scan,
     master=Master,
+    address=NumberAddress(
+        key="slave", lowest=2, highest=4, labelled=True, has_serial=False
+    ),
+    # Three boxes at most; the minimum as in the menu of a box (MIN).
+    supply=SupplyRange(highest=3 * MAXIMUM_CURRENT, highest_minimum=16),
+    serials=_SERIALS,
 )
 
 __all__ = [

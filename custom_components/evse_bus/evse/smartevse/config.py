@@ -1,6 +1,7 @@
 """What the user sets up for a SmartEVSE."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from ..model import ChargerConfig
 from .balancing import SLAVES
@@ -29,6 +30,8 @@ class SmartEvseConfig(ChargerConfig):
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PolledConfig(SmartEvseConfig):
     """A SmartEVSE without load balancing, or one that is its own master."""
+
+    live: ClassVar = ChargerConfig.live | {"stop_on_shutdown"}
 
     stop_on_shutdown: bool = False
     """Turn its access off when everything stops: it has no fail-safe of its own."""
