@@ -155,7 +155,7 @@ def _charger(coordinator: BusCoordinator, managed: ManagedCharger) -> dict[str, 
 
 def _frames(
     coordinator: BusCoordinator, bus: Bus, chargers: Sequence[ManagedCharger]
-) -> list[dict[str, str]]:
+) -> list[dict[str, str | int]]:
     """Return the last frames of a bus, with the serial numbers hidden."""
     numbers = coordinator.protocol.serials
     known: set[str | None] = set()
@@ -168,6 +168,7 @@ def _frames(
         {
             "time": datetime.fromtimestamp(frame.when, UTC).isoformat(),
             "direction": str(frame.direction),
+            "bytes": frame.length,
             "hex": numbers.hide(
                 frame.data,
                 serials,

@@ -1,15 +1,27 @@
 """What must not bring a bus down, in simulated time."""
 
 import asyncio
+import logging
+import sys
 from typing import override
 
+from hypothesis import given, strategies as st
 import pytest
 
+from custom_components.evse_bus.evse import bus as bus_module
+from custom_components.evse_bus.evse.bus import FAILURES_LOGGED
 from custom_components.evse_bus.evse.conversation import rest
 from custom_components.evse_bus.evse.errors import LineLostError, NotAvailableError
 from custom_components.evse_bus.evse.exchange import Turn
 from custom_components.evse_bus.evse.model import OrderChange, Orders
 from custom_components.evse_bus.evse.safety import clamp
+from custom_components.evse_bus.evse.statistics import (
+    KEPT_BYTES,
+    KEPT_FRAMES,
+    KEPT_OF_FRAME,
+    Direction,
+    FrameLog,
+)
 
 from .simulated import Scene, SimulatedCharger, SimulatedLine, simulate
 
@@ -263,3 +275,81 @@ def test_a_pause_that_is_said_again_does_not_overtake_the_start_after_it() -> No
             assert charger.orders.allowed is True
 
     simulate(scene())
+
+
+@pytest.mark.parametrize("part", ["choose", "_slots"])
+def test_a_schedule_that_fails_does_not_block_the_loop(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, part: str
+) -> None:
+    calls = 0
+
+    async def scene() -> None:
+        async with Scene(interval=1.0) as bus:
+            await asyncio.sleep(2)
+
+            def broken(*_args: object) -> None:
+                nonlocal calls
+                calls += 1
+                if calls > 10_000:
+                    pytest.fail("the loop spins")
+                raise ZeroDivisionError
+
+            with monkeypatch.context() as patched:
+                owner = bus_module if part == "choose" else bus.bus
+                patched.setattr(owner, part, broken)
+                await asyncio.sleep(3600)
+            assert 10 <= calls <= 3700
+            # The cause is fixed: the charger is polled again.
+            count = len(bus.line.times(1))
+            await asyncio.sleep(20)
+            assert len(bus.line.times(1)) - count >= 17
+
+    simulate(scene())
+    errors = [one for one in caplog.records if one.levelno == logging.ERROR]
+    assert len(errors) == FAILURES_LOGGED
+
+
+def test_a_bus_whose_schedule_fails_can_be_stopped(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def scene() -> None:
+        async with Scene(interval=1.0):
+
+            def broken(*_args: object) -> None:
+                raise ZeroDivisionError
+
+            monkeypatch.setattr(bus_module, "choose", broken)
+            await asyncio.sleep(10)
+        assert len(asyncio.all_tasks()) == 1
+
+    simulate(scene())
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(Direction), st.integers(0, 300_000)), max_size=300
+    )
+)
+def test_the_log_of_frames_is_bounded(added: list[tuple[Direction, int]]) -> None:
+    log = FrameLog()
+    chunk = memoryview(bytes(300_000))
+    for direction, length in added:
+        log.add(direction, bytes(chunk[:length]))
+    kept = list(log)
+    assert len(kept) <= KEPT_FRAMES
+    assert sum(len(one.data) for one in kept) <= KEPT_BYTES
+    # The newest are kept, with their length on the line.
+    newest = added[len(added) - len(kept) :]
+    assert [(one.direction, one.length) for one in kept] == newest
+    assert all(len(one.data) == min(one.length, KEPT_OF_FRAME) for one in kept)
+    if sum(min(length, KEPT_OF_FRAME) for _, length in added) <= KEPT_BYTES:
+        assert len(kept) == min(len(added), KEPT_FRAMES)
+
+
+def test_a_whole_read_of_noise_is_not_kept() -> None:
+    """200 reads of 256 kB each stayed in memory as 50 MB."""
+    log = FrameLog()
+    for _ in range(200):
+        log.add(Direction.UNREADABLE, bytes(256 * 1024))
+    assert sum(sys.getsizeof(one.data) for one in log) < 80_000
+    assert {one.length for one in log} == {256 * 1024}

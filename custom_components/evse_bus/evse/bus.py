@@ -30,7 +30,7 @@ from .listeners import Observable
 from .master import BusMaster, ChargerGroup
 from .model import OrderChange, Persistence
 from .schedule import Kind, Slot, choose
-from .throttle import LogThrottle
+from .throttle import LogThrottle, RateLimiter
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -40,6 +40,11 @@ REOPEN_LIMIT: Final = 30.0
 """Longest such pause, s."""
 STOP_PATIENCE: Final = 6.0
 """Longest time a stop waits for a conversation begun (waking a car: 3 s), s."""
+FAILURE_PAUSE: Final = 1.0
+"""Pause after a failure that belongs to no turn, s: without it the loop would spin."""
+FAILURES_LOGGED: Final = 20
+FAILURES_WINDOW: Final = 3600.0
+"""Unexpected failures logged with a traceback within this time, s."""
 
 
 class WakeTimer:
@@ -105,6 +110,7 @@ class Bus(Observable):
         self._turn_of: Slot | None = None
         self._turn_over = asyncio.Event()
         self._last_probe = -inf
+        self._failures = RateLimiter(FAILURES_LOGGED, FAILURES_WINDOW)
         line.on_lost = self._on_lost
         if group is not None:
             group.bus = self
@@ -275,8 +281,18 @@ class Bus(Observable):
                 await self._serve(slot)
             except Exception:
                 # Without this task all chargers of the bus would fall silent.
-                _LOGGER.exception("%s: a turn failed unexpectedly", self.name)
-                if slot is not None:
+                level = (
+                    logging.ERROR if self._failures.take(self.now) else logging.DEBUG
+                )
+                _LOGGER.log(
+                    level,
+                    "%s: a turn failed unexpectedly",
+                    self.name,
+                    exc_info=True,
+                )
+                if slot is None:
+                    await asyncio.sleep(FAILURE_PAUSE)
+                else:
                     slot.ready = self.now + self.wire.timing.backoff
 
     async def _serve(self, slot: Slot) -> None:

@@ -11,6 +11,10 @@ from typing import Final
 WINDOW: Final = 60.0
 """Time over which utilisation is computed, s."""
 KEPT_FRAMES: Final = 200
+KEPT_OF_FRAME: Final = 1024
+"""Bytes kept of one frame, or of one unreadable chunk."""
+KEPT_BYTES: Final = 65536
+"""Bytes kept of all frames together."""
 
 
 @dataclass(slots=True)
@@ -105,18 +109,26 @@ class LoggedFrame:
     """Seconds since the epoch."""
     direction: Direction
     data: bytes
+    """The first `KEPT_OF_FRAME` bytes."""
+    length: int
+    """Number of bytes on the line."""
 
 
 class FrameLog:
-    """The last frames on a bus, for diagnostics."""
+    """The last frames on a bus, for diagnostics; bounded, whatever a line delivers."""
 
     def __init__(self) -> None:
         """Start empty."""
-        self._frames: deque[LoggedFrame] = deque(maxlen=KEPT_FRAMES)
+        self._frames: deque[LoggedFrame] = deque()
+        self._bytes = 0
 
     def add(self, direction: Direction, data: bytes) -> None:
-        """Log a frame; the oldest one is dropped."""
-        self._frames.append(LoggedFrame(time(), direction, data))
+        """Log a frame; the oldest ones are dropped."""
+        kept = data[:KEPT_OF_FRAME]
+        self._frames.append(LoggedFrame(time(), direction, kept, len(data)))
+        self._bytes += len(kept)
+        while len(self._frames) > KEPT_FRAMES or self._bytes > KEPT_BYTES:
+            self._bytes -= len(self._frames.popleft().data)
 
     def __iter__(self) -> Iterator[LoggedFrame]:
         """Return the frames, oldest first."""
