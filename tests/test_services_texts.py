@@ -21,7 +21,7 @@ from custom_components.evse_bus.actions.parameters import (
     TIME_ZONES,
 )
 from custom_components.evse_bus.const import DOMAIN
-from custom_components.evse_bus.errors import EWS_KEYS, ActionError
+from custom_components.evse_bus.errors import ActionError
 from custom_components.evse_bus.evse.errors import RefusedOrderError
 from custom_components.evse_bus.evse.ews.wire.answers import Refusal
 from custom_components.evse_bus.evse.ews.wire.cards import ENTRIES, LARGEST
@@ -172,11 +172,11 @@ async def test_home_assistant_takes_the_descriptions(hass: HomeAssistant) -> Non
 
 def test_every_refusal_has_a_text() -> None:
     texts = english()["exceptions"]
-    assert EWS_KEYS.keys() == set(Refusal)
-    for reason, key in EWS_KEYS.items():
-        assert "{charger}" in texts[key]["message"], reason
+    keys = {f"ews_{reason}" for reason in Refusal}
+    for key in keys:
+        assert "{charger}" in texts[key]["message"], key
     assert {key for key in texts if key.startswith("ews_")} == {
-        *EWS_KEYS.values(),
+        *keys,
         "ews_secret_hidden",
     }
     assert set(ActionError) <= texts.keys()

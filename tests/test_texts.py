@@ -19,9 +19,10 @@ from custom_components.evse_bus.errors import (
     _COMMAND_KEYS,
     _LISTEN_KEYS,
     _PORT_KEYS,
-    EWS_KEYS,
     ActionError,
 )
+from custom_components.evse_bus.evse.ews.wire.answers import Refusal
+from custom_components.evse_bus.evse.ews.wire.parameters import HiddenSecretError
 from custom_components.evse_bus.issues import (
     DUPLICATE_ADDRESS,
     LOST,
@@ -109,12 +110,13 @@ def test_icons_belong_to_entities(platform: str) -> None:
 def test_errors_have_texts() -> None:
     texts = english()["exceptions"]
     keys = {key for _, key in (*_PORT_KEYS, *_LISTEN_KEYS, *_COMMAND_KEYS)}
-    assert keys | set(EWS_KEYS.values()) | set(ActionError) == texts.keys()
+    own = {f"ews_{reason}" for reason in Refusal} | {HiddenSecretError.text_key}
+    assert keys | own | set(ActionError) == texts.keys()
     placeholders = dict.fromkeys(("charger", "port", "error", "expected", "found"), "x")
     for key in keys:
-        assert texts[key]["message"].format(**placeholders, secrets="x")
-    for key in EWS_KEYS.values():
-        assert texts[key]["message"].format(charger="x", code="x")
+        assert texts[key]["message"].format(**placeholders)
+    for key in own:
+        assert texts[key]["message"].format(charger="x", code="x", secrets="x")
 
 
 def test_issues_have_texts() -> None:

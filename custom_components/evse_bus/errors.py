@@ -33,8 +33,6 @@ from .evse.errors import (
     SupersededError,
     WrongChargerError,
 )
-from .evse.ews.wire.answers import EwsRefusedError, Refusal
-from .evse.ews.wire.parameters import HiddenSecretError
 
 # The first class that matches counts, so subclasses come before their base.
 _PORT_KEYS: Final[tuple[tuple[type[LineError], str], ...]] = (
@@ -52,7 +50,6 @@ _LISTEN_KEYS: Final[tuple[tuple[type[LineError], str], ...]] = (
 )
 
 _COMMAND_KEYS: Final[tuple[tuple[type[EvseError], str], ...]] = (
-    (HiddenSecretError, "ews_secret_hidden"),
     (RefusedOrderError, "order_refused"),
     (SupersededError, "superseded"),
     (WrongChargerError, "wrong_charger"),
@@ -69,9 +66,6 @@ _COMMAND_KEYS: Final[tuple[tuple[type[EvseError], str], ...]] = (
     (NotAvailableError, "not_available"),
     (EvseError, "command_failed"),
 )
-
-EWS_KEYS: Final[Mapping[Refusal, str]] = {reason: f"ews_{reason}" for reason in Refusal}
-"""Translation keys of the reasons for which an EWS-Box refuses a command."""
 
 
 class ActionError(StrEnum):
@@ -149,18 +143,9 @@ def translated_errors(charger: str, port: str) -> Iterator[None]:
         yield
     except EvseError as error:
         placeholders = {"charger": charger, "port": port, "error": str(error)}
-        if isinstance(error, EwsRefusedError):
-            key = EWS_KEYS[error.reason]
-            placeholders["code"] = str(error.code)
-        else:
-            key = next(key for kind, key in _COMMAND_KEYS if isinstance(error, kind))
-        if isinstance(error, HiddenSecretError):
-            placeholders["secrets"] = ", ".join(error.names)
-        if isinstance(error, WrongChargerError):
-            placeholders |= {
-                "expected": error.expected or "-",
-                "found": error.found,
-            }
+        key = error.text_key or next(
+            key for kind, key in _COMMAND_KEYS if isinstance(error, kind)
+        )
         kind = (
             ServiceValidationError
             if isinstance(error, RefusedOrderError)
@@ -169,5 +154,5 @@ def translated_errors(charger: str, port: str) -> Iterator[None]:
         raise kind(
             translation_domain=DOMAIN,
             translation_key=key,
-            translation_placeholders=placeholders,
+            translation_placeholders=placeholders | error.details,
         ) from error

@@ -3,9 +3,19 @@
 This module imports nothing of the project and nothing of Home Assistant.
 """
 
+from typing import override
+
 
 class EvseError(Exception):
     """Base class of all errors that this library raises on purpose."""
+
+    text_key: str | None = None
+    """Key of a translated message of its own; ``None``: the class has one."""
+
+    @property
+    def details(self) -> dict[str, str]:
+        """Return values that a translated message can contain, by name."""
+        return {}
 
 
 class LineError(EvseError):
@@ -56,6 +66,11 @@ class ExchangeRefusedError(ExchangeError):
         super().__init__(message)
         self.code = code
 
+    @property
+    @override
+    def details(self) -> dict[str, str]:
+        return {"code": "-" if self.code is None else str(self.code)}
+
 
 class ImplausibleReplyError(ExchangeError):
     """A frame with good checksums and impossible content; not used."""
@@ -69,6 +84,11 @@ class WrongChargerError(EvseError):
         super().__init__(message)
         self.expected = expected
         self.found = found
+
+    @property
+    @override
+    def details(self) -> dict[str, str]:
+        return {"expected": self.expected or "-", "found": self.found}
 
 
 class DuplicateAddressError(EvseError):

@@ -121,6 +121,7 @@ class EwsRefusedError(ExchangeRefusedError):
         super().__init__(f"{MESSAGES[reason]} ({command}: {code})", code)
         self.command = command
         self.reason = reason
+        self.text_key = f"ews_{reason}"
 
 
 def refusal(command: CommandId, code: int) -> Refusal:

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import KEEP, Enum, IntEnum, IntFlag
 from ipaddress import IPv4Address
-from typing import Final
+from typing import Final, override
 
 from ...errors import RefusedOrderError
 from ...fields import Flag, Flags, Number, Raw, Text
@@ -186,6 +186,8 @@ EXTRA: Final = Struct(ExtraParameters, "3.2.4 sz")
 class HiddenSecretError(RefusedOrderError):
     """A block that was not written, since that would erase what the box hides."""
 
+    text_key: str | None = "ews_secret_hidden"
+
     def __init__(self, source: str, names: tuple[str, ...]) -> None:
         """Keep the names of the secrets."""
         super().__init__(
@@ -193,6 +195,11 @@ class HiddenSecretError(RefusedOrderError):
             "what is not named as well"
         )
         self.names = names
+
+    @property
+    @override
+    def details(self) -> dict[str, str]:
+        return {"secrets": ", ".join(self.names)}
 
 
 class Shown(Enum):
