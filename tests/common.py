@@ -148,7 +148,7 @@ async def running(
 
     ``time_scale``: the devices' time runs faster; ``supply``: what they share.
     """
-    with VirtualBus.pty(*devices, time_scale=time_scale) as bus:
+    with VirtualBus.in_loop(*devices, time_scale=time_scale) as bus:
         chargers = [charger_of(device, **data) for device in devices]
         protocol = protocol_of(devices[0])
         entry = await setup_bus(hass, protocol, bus.url, *chargers, **(supply or {}))

@@ -1,15 +1,22 @@
 """What every test needs.
 
+Time: async tests run in simulated time (`tests.simulated_time`), in which virtual
+buses and boxes live on the loop of the test. A test of ptys, sockets or programs at
+their real pace is marked ``real_time``, and ``slow`` if that takes long.
+
 Network: the test plugin blocks IP sockets. A test (or fixture) that serves or
 dials 127.0.0.1 asks for the fixture ``socket_enabled``; ptys are not blocked.
 """
 
-from collections.abc import Iterator
+import asyncio
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 import sys
+from typing import Any
 from unittest.mock import PropertyMock, patch
 
+from homeassistant import runner
 from hypothesis import settings
 import pytest
 from pytest_homeassistant_custom_component.syrupy import HomeAssistantSnapshotExtension
@@ -18,7 +25,10 @@ from syrupy.assertion import SnapshotAssertion
 # Home Assistant finds custom integrations by importing the package
 # custom_components. The test plugin has one of its own: ours must be first.
 import custom_components
+from custom_components.evse_bus.evse import line
 from custom_components.evse_bus.evse.protocols import PROTOCOLS
+from tests.simulated_time import SimulatedLoop
+from tests.virtual.ports import DirectPort
 
 assert Path(custom_components.__file__).parents[1] == Path(__file__).parents[1]
 
@@ -36,6 +46,48 @@ def integration_can_load(request: pytest.FixtureRequest) -> None:
     # Our dependency `usb` would look at this machine's real ports. The other one,
     # `network`, is set up as it is: the test plugin shows it one adapter, 10.10.10.10.
     request.getfixturevalue("hass").config.components.add("usb")
+
+
+@pytest.fixture
+def _function_scoped_runner(request: pytest.FixtureRequest) -> Iterator[asyncio.Runner]:
+    """Run tests in simulated time; in place of pytest-asyncio's fixture.
+
+    Its own hook for other loops would make the loop of the session anew for each test.
+    """
+    real = request.node.get_closest_marker("real_time")
+    factory = asyncio.new_event_loop if real else SimulatedLoop
+    with asyncio.Runner(loop_factory=factory) as made:
+        asyncio.set_event_loop(made.get_loop())
+        yield made
+    asyncio.set_event_loop(None)
+
+
+@pytest.fixture(autouse=True)
+async def configure_event_loop() -> None:
+    """Configure a loop as Home Assistant does, but leave it its own clock."""
+    loop = asyncio.get_running_loop()
+    runner.configure_event_loop(loop)
+    if isinstance(loop, SimulatedLoop):
+        del loop.time
+
+
+@pytest.fixture(autouse=True)
+def direct_ports(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the library open the ports of virtual buses that live on its loop."""
+    serialx = line.create_serial_connection
+
+    async def connect[P: asyncio.Protocol](
+        loop: asyncio.AbstractEventLoop,
+        factory: Callable[[], P],
+        url: str,
+        **settings: Any,  # noqa: ANN401 - serialx' own
+    ) -> tuple[object, P]:
+        if (port := DirectPort.find(url)) is None:
+            return await serialx(loop, factory, url, **settings)
+        protocol = factory()
+        return port.open(protocol), protocol
+
+    monkeypatch.setattr(line, "create_serial_connection", connect)
 
 
 @pytest.fixture

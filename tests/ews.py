@@ -125,7 +125,10 @@ def listener_entry(
 def dialler_of(entry: MockConfigEntry, box: EwsBox, **options: Any) -> EwsDialler:  # noqa: ANN401 - of a dialler
     """Return what dials a listener for a box; begun by ``with``."""
     return EwsDialler(
-        box, HOST, entry.data["port"], **{"retry": RETRY, "source_ports": 0, **options}
+        box,
+        HOST,
+        entry.data["port"],
+        **{"retry": RETRY, "source_ports": 0, "own_thread": False, **options},
     )
 
 

@@ -74,6 +74,7 @@ def dialling(
         listener_of(entry).port if port is None else port,
         retry=RETRY,
         source_ports=0,
+        own_thread=False,
     ) as dialler:
         yield dialler
 

@@ -231,6 +231,7 @@ def test_an_offer_after_a_set_point_is_found() -> None:
     assert offered_after(Called("a", 6.0, 4.5, 4.6), offers) is None
 
 
+@pytest.mark.real_time
 async def test_blocks_are_timed_and_the_loop_left_as_it_was() -> None:
     before = asyncio.Handle._run
     with watch() as blocks:
@@ -242,6 +243,7 @@ async def test_blocks_are_timed_and_the_loop_left_as_it_was() -> None:
     assert blocks.as_dict()["callbacks"] == len(blocks.seconds)
 
 
+@pytest.mark.real_time
 async def test_garbage_collection_is_told_apart_from_what_a_callback_does() -> None:
     # Something to go through: more of it than the little that is told of.
     held = [[n] for n in range(300_000)]

@@ -28,7 +28,7 @@ async def test_abl_boxes_are_found_and_added(hass: HomeAssistant) -> None:
         AblBox(5, serial="2W22xy00000005"),
         AblBox(16, serial="2W22xy00000016"),
     )
-    with VirtualBus.pty(*boxes) as bus:
+    with VirtualBus.in_loop(*boxes) as bus:
         flow = await port_step(hass, "abl", bus.url)
         assert flow.step == "scan"
         await flow.wait()
@@ -101,7 +101,7 @@ async def test_abl_boxes_are_found_and_added(hass: HomeAssistant) -> None:
 
 
 async def test_nobody_answers_then_typed_in_by_hand(hass: HomeAssistant) -> None:
-    with VirtualBus.pty(parity="E") as bus:
+    with VirtualBus.in_loop(parity="E") as bus:
         flow = await port_step(hass, "abl", bus.url)
         await flow.wait()
         assert flow.step == "nothing_found"
@@ -124,7 +124,7 @@ async def test_nobody_answers_then_typed_in_by_hand(hass: HomeAssistant) -> None
 async def test_searching_again_finds_a_box_switched_on_meanwhile(
     hass: HomeAssistant,
 ) -> None:
-    with VirtualBus.pty(parity="E") as bus:
+    with VirtualBus.in_loop(parity="E") as bus:
         flow = await port_step(hass, "abl", bus.url)
         await flow.wait()
         assert flow.step == "nothing_found"
@@ -141,7 +141,7 @@ async def test_typed_by_hand_keeps_the_serial_that_was_read(
     twin = AblBox(1, serial="2W22xy00000001")
     other = AblBox(1, serial="2W22xy00000002")
     third = AblBox(4, serial="2W22xy00000004")
-    with VirtualBus.pty(twin, other, third) as bus:
+    with VirtualBus.in_loop(twin, other, third) as bus:
         flow = await port_step(hass, "abl", bus.url)
         await flow.wait()
         assert flow.step == "duplicates"
@@ -161,7 +161,7 @@ async def test_two_boxes_with_one_id_are_told_and_not_written_to(
     hass: HomeAssistant,
 ) -> None:
     twins = AblBox(1, serial="2W22xy00000001"), AblBox(1, serial="2W22xy00000002")
-    with VirtualBus.pty(*twins) as bus:
+    with VirtualBus.in_loop(*twins) as bus:
         flow = await port_step(hass, "abl", bus.url)
         await flow.wait()
         assert flow.step == "duplicates"
@@ -181,7 +181,7 @@ async def test_the_others_can_be_added_beside_two_with_one_id(
     hass: HomeAssistant,
 ) -> None:
     boxes = AblBox(1, serial="2W22xy00000001"), AblBox(1, serial="2W22xy00000002")
-    with VirtualBus.pty(*boxes, AblBox(7)) as bus:
+    with VirtualBus.in_loop(*boxes, AblBox(7)) as bus:
         flow = await port_step(hass, "abl", bus.url)
         await flow.wait()
         await flow.choose("select")
@@ -197,7 +197,7 @@ async def test_the_others_can_be_added_beside_two_with_one_id(
 
 async def test_noise_in_place_of_answers_is_told_as_such(hass: HomeAssistant) -> None:
     boxes = tuple(AblBox(address) for address in range(1, 17))
-    with VirtualBus.pty(*boxes) as bus:
+    with VirtualBus.in_loop(*boxes) as bus:
         for box in boxes:
             # What an even parity looks like to who expects none, more or less.
             box.faults.byte_error_rate = 1.0
@@ -211,7 +211,7 @@ async def test_noise_in_place_of_answers_is_told_as_such(hass: HomeAssistant) ->
 
 
 async def test_adapter_unplugged_during_the_search(hass: HomeAssistant) -> None:
-    with VirtualBus.pty(parity="E") as bus:
+    with VirtualBus.in_loop(parity="E") as bus:
         flow = await port_step(hass, "abl", bus.url)
         await bus.wait_for_async(lambda: len(requests_in(bus.log.bursts())) > 2)
         bus.unplug()
@@ -225,7 +225,7 @@ async def test_adapter_unplugged_during_the_search(hass: HomeAssistant) -> None:
 
 
 async def test_port_gone_before_the_search(hass: HomeAssistant) -> None:
-    with VirtualBus.pty(parity="E") as bus:
+    with VirtualBus.in_loop(parity="E") as bus:
         flow = await port_step(hass, "abl", bus.url)
         await flow.wait()
         bus.unplug()
@@ -241,7 +241,7 @@ async def test_closing_the_dialogue_in_mid_search_leaves_nothing_open(
     hass: HomeAssistant, after: int
 ) -> None:
     before = asyncio.all_tasks()
-    with VirtualBus.pty(parity="E") as bus:
+    with VirtualBus.in_loop(parity="E") as bus:
         flow = await port_step(hass, "abl", bus.url)
         await bus.wait_for_async(lambda: len(requests_in(bus.log.bursts())) >= after)
         flow.abort()

@@ -23,7 +23,7 @@ async def test_single_evbox_is_found_with_confirmed_values_only(
     hass: HomeAssistant,
 ) -> None:
     box = EvboxChargePoint(1923054, modules=2)
-    with VirtualBus.pty(box) as bus:
+    with VirtualBus.in_loop(box) as bus:
         flow = await port_step(hass, "evbox", bus.url)
         assert flow.step == "impose"
         assert flow.result["menu_options"] == [
@@ -98,7 +98,7 @@ async def test_single_evbox_is_found_with_confirmed_values_only(
 async def test_evboxes_are_found_by_their_serial_numbers(hass: HomeAssistant) -> None:
     wanted = EvboxChargePoint(1923054), EvboxChargePoint(777)
     stranger = EvboxChargePoint(4444)
-    with VirtualBus.pty(*wanted, stranger) as bus:
+    with VirtualBus.in_loop(*wanted, stranger) as bus:
         flow = await port_step(hass, "evbox", bus.url)
         await flow.choose("search_addresses")
         await flow.submit(IMPOSED | {"serial_numbers": ["01923054", "x"]})
@@ -128,7 +128,7 @@ async def test_evboxes_are_found_by_their_serial_numbers(hass: HomeAssistant) ->
 async def test_single_evbox_that_knows_only_69_is_asked_for_its_serial_number(
     hass: HomeAssistant,
 ) -> None:
-    with VirtualBus.pty(EvboxChargePoint(1923054)) as bus:
+    with VirtualBus.in_loop(EvboxChargePoint(1923054)) as bus:
         flow = await port_step(hass, "evbox", bus.url)
         await flow.choose("search_single")
         await flow.submit(IMPOSED | {"command": "69", "search_current": "0"})
@@ -151,7 +151,7 @@ async def test_single_evbox_that_knows_only_69_is_asked_for_its_serial_number(
 async def test_message_without_serial_number_is_for_a_box_alone(
     hass: HomeAssistant,
 ) -> None:
-    with VirtualBus.pty() as bus:
+    with VirtualBus.in_loop() as bus:
         flow = await port_step(hass, "evbox", bus.url)
         await flow.choose("manual")
         await flow.submit({"serial_numbers": ["1", "2"]})
@@ -165,7 +165,7 @@ async def test_message_without_serial_number_is_for_a_box_alone(
 
 
 async def test_nobody_answers_an_evbox_search(hass: HomeAssistant) -> None:
-    with VirtualBus.pty() as bus:
+    with VirtualBus.in_loop() as bus:
         flow = await port_step(hass, "evbox", bus.url)
         await flow.choose("search_single")
         await flow.submit(IMPOSED)
@@ -194,7 +194,7 @@ async def test_answers_that_nobody_can_read(
     hass: HomeAssistant, search: str, addresses: dict[str, Any], step: str
 ) -> None:
     box = EvboxChargePoint(42, min_interval=0)
-    with VirtualBus.pty(box) as bus:
+    with VirtualBus.in_loop(box) as bus:
         box.faults.once("corrupt")
         box.faults.once("corrupt")
         flow = await port_step(hass, "evbox", bus.url)
@@ -210,7 +210,7 @@ async def test_answers_that_nobody_can_read(
 
 
 async def test_evbox_typed_in_without_a_word_on_the_wire(hass: HomeAssistant) -> None:
-    with VirtualBus.pty(EvboxChargePoint(1923054)) as bus:
+    with VirtualBus.in_loop(EvboxChargePoint(1923054)) as bus:
         flow = await port_step(hass, "evbox", bus.url)
         await flow.choose("manual")
         await flow.submit({"serial_numbers": ["123456789"]})
@@ -237,7 +237,7 @@ async def test_evbox_typed_in_without_a_word_on_the_wire(hass: HomeAssistant) ->
 async def test_the_only_evbox_may_stay_without_its_serial_number(
     hass: HomeAssistant,
 ) -> None:
-    with VirtualBus.pty() as bus:
+    with VirtualBus.in_loop() as bus:
         flow = await port_step(hass, "evbox", bus.url)
         await flow.choose("manual")
         await flow.submit({"serial_numbers": ["0"]})
@@ -251,7 +251,7 @@ async def test_the_only_evbox_may_stay_without_its_serial_number(
 
 
 async def test_somebody_else_talks_all_the_time(hass: HomeAssistant) -> None:
-    with VirtualBus.pty(EvboxChargePoint(1923054)) as bus:
+    with VirtualBus.in_loop(EvboxChargePoint(1923054)) as bus:
         bus.foreign_traffic(b"\x02ABCD\x03" * 8, 0.02)
         flow = await port_step(hass, "evbox", bus.url)
         await flow.choose("search_single")
@@ -288,7 +288,7 @@ async def test_somebody_else_talks_all_the_time(hass: HomeAssistant) -> None:
 async def test_charger_form_says_what_is_wrong(
     hass: HomeAssistant, wrong: dict[str, Any], errors: dict[str, str]
 ) -> None:
-    with VirtualBus.pty() as bus:
+    with VirtualBus.in_loop() as bus:
         flow = await port_step(hass, "evbox", bus.url)
         await flow.choose("manual")
         await flow.submit({"serial_numbers": ["42"]})
@@ -319,7 +319,7 @@ async def test_charger_form_says_what_is_wrong(
 async def test_charger_form_takes_nothing_out_of_range(
     hass: HomeAssistant, wrong: dict[str, Any]
 ) -> None:
-    with VirtualBus.pty() as bus:
+    with VirtualBus.in_loop() as bus:
         flow = await port_step(hass, "evbox", bus.url)
         await flow.choose("manual")
         await flow.submit({"serial_numbers": ["42"]})

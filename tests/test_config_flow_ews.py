@@ -47,7 +47,7 @@ def table(flow: Flow) -> str:
 async def test_box_is_found_added_and_runs(hass: HomeAssistant) -> None:
     box = EwsBox(serial=SERIAL, jumper=20, max_current=13)
     box.extra.max_current_2 = 10
-    with VirtualBus.pty(box) as bus:
+    with VirtualBus.in_loop(box) as bus:
         flow = await searched(hass, bus)
         assert flow.progress == sorted(flow.progress)
         assert flow.progress[-1] == 1
@@ -119,7 +119,7 @@ async def test_box_is_found_added_and_runs(hass: HomeAssistant) -> None:
 
 
 async def test_box_with_one_port_is_one_charger(hass: HomeAssistant) -> None:
-    with VirtualBus.pty(EwsBox(serial=SERIAL, ports=1)) as bus:
+    with VirtualBus.in_loop(EwsBox(serial=SERIAL, ports=1)) as bus:
         flow = await searched(hass, bus)
         await flow.submit({"chargers": SERIAL})
         assert flow.tells("port by port: 32 A.")
@@ -145,7 +145,7 @@ async def test_box_with_one_port_is_one_charger(hass: HomeAssistant) -> None:
 @pytest.mark.usefixtures("not_set_up")
 async def test_household_socket_is_offered_what_it_needs(hass: HomeAssistant) -> None:
     box = EwsBox(serial=SERIAL, jumper=32, max_current=10, mode1=(False, True))
-    with VirtualBus.pty(box) as bus:
+    with VirtualBus.in_loop(box) as bus:
         flow = await searched(hass, bus)
         await flow.submit({"chargers": SERIAL})
         assert flow.tells("port by port: 10 A + 16 A")
@@ -160,7 +160,7 @@ async def test_household_socket_is_offered_what_it_needs(hass: HomeAssistant) ->
 async def test_nobody_answers_then_the_first_box_that_comes_is_kept(
     hass: HomeAssistant,
 ) -> None:
-    with VirtualBus.pty(baud=115200) as bus:
+    with VirtualBus.in_loop(baud=115200) as bus:
         flow = await searched(hass, bus)
         assert flow.step == "nothing_found"
         assert flow.result["menu_options"] == ["scan", "manual", "port"]
@@ -226,7 +226,7 @@ async def test_nobody_answers_then_the_first_box_that_comes_is_kept(
 async def test_searching_again_finds_a_box_switched_on_meanwhile(
     hass: HomeAssistant,
 ) -> None:
-    with VirtualBus.pty(baud=115200) as bus:
+    with VirtualBus.in_loop(baud=115200) as bus:
         flow = await searched(hass, bus)
         assert flow.step == "nothing_found"
         bus.add(EwsBox(serial=SERIAL))
@@ -240,7 +240,7 @@ async def test_searching_again_finds_a_box_switched_on_meanwhile(
 async def test_answers_that_make_no_sense(hass: HomeAssistant) -> None:
     box = EwsBox(serial=SERIAL)
     box.faults.byte_error_rate = 0.5
-    with VirtualBus.pty(box) as bus:
+    with VirtualBus.in_loop(box) as bus:
         flow = await searched(hass, bus)
         assert flow.step == "unreadable"
         assert flow.result["menu_options"] == ["scan", "manual", "port"]
@@ -255,7 +255,7 @@ async def test_answers_that_make_no_sense(hass: HomeAssistant) -> None:
 async def test_what_is_wrong_with_the_form_is_said_at_its_field(
     hass: HomeAssistant,
 ) -> None:
-    with VirtualBus.pty(baud=115200) as bus:
+    with VirtualBus.in_loop(baud=115200) as bus:
         flow = await by_hand(hass, bus)
         for wrong, errors in (
             ({"box_serial": "12-34"}, {"box_serial": "bad_box_serial"}),

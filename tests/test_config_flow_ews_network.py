@@ -188,7 +188,7 @@ async def test_listener_moves_to_another_port(hass: HomeAssistant) -> None:
     await hass.async_block_till_done()
     entry = flow.result["result"]
     with dialling(entry) as before:
-        await before.wait_for_async(lambda: before.dial_port.connected)
+        await before.wait_for_async(lambda: before.box.requests)
 
         flow = await Flow.change_bus(hass, entry)
         assert flow.step == "reconfigure_listen"
@@ -209,7 +209,7 @@ async def test_listener_moves_to_another_port(hass: HomeAssistant) -> None:
         assert entry.title == f"EWS-Boxes ({HOST}:{second})"
         await before.wait_for_async(lambda: not before.dial_port.connected)
     with dialling(entry) as after:
-        await after.wait_for_async(lambda: after.dial_port.connected)
+        await after.wait_for_async(lambda: after.box.requests)
     assert await hass.config_entries.async_unload(entry.entry_id)
 
 

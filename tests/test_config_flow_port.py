@@ -32,6 +32,7 @@ pytestmark = pytest.mark.usefixtures("not_set_up", "quick_search")
 OPEN = "custom_components.evse_bus.evse.line.create_serial_connection"
 
 
+@pytest.mark.real_time
 async def test_port_errors_are_told_apart(hass: HomeAssistant, tmp_path: Path) -> None:
     with VirtualBus.pty() as bus:
         flow = await port_step(hass, "evbox", NOWHERE)
@@ -94,6 +95,7 @@ async def test_network_port_that_nobody_serves(hass: HomeAssistant) -> None:
     flow.abort()
 
 
+@pytest.mark.real_time
 @pytest.mark.usefixtures("socket_enabled")
 async def test_bus_on_a_network_port(hass: HomeAssistant) -> None:
     with VirtualBus.tcp(EvboxChargePoint(42)) as bus:
@@ -109,7 +111,7 @@ async def test_bus_on_a_network_port(hass: HomeAssistant) -> None:
 
 
 async def test_overrides_are_stored_and_used(hass: HomeAssistant) -> None:
-    with VirtualBus.pty() as bus:
+    with VirtualBus.in_loop() as bus:
         flow = await port_step(
             hass, "evbox", bus.url, baudrate=19200, parity="e", stop_bits="2"
         )
@@ -127,7 +129,7 @@ async def test_overrides_are_stored_and_used(hass: HomeAssistant) -> None:
 
 
 async def test_one_port_is_one_bus(hass: HomeAssistant, tmp_path: Path) -> None:
-    with VirtualBus.pty() as bus:
+    with VirtualBus.in_loop() as bus:
         MockConfigEntry(
             domain=DOMAIN, data={"protocol": "abl", "device": bus.url}
         ).add_to_hass(hass)

@@ -28,7 +28,7 @@ pytestmark = pytest.mark.usefixtures("quick_search")
 
 async def test_abl_bus_runs_right_after_it_was_added(hass: HomeAssistant) -> None:
     box = AblBox(3, default_current=32)
-    with VirtualBus.pty(box) as bus:
+    with VirtualBus.in_loop(box) as bus:
         flow = await port_step(hass, "abl", bus.url)
         await flow.wait()
         await flow.submit({"chargers": ["3"], "installation_limit": 16})
@@ -46,7 +46,7 @@ async def test_abl_bus_runs_right_after_it_was_added(hass: HomeAssistant) -> Non
 
 async def test_evbox_bus_runs_right_after_it_was_added(hass: HomeAssistant) -> None:
     box = EvboxChargePoint(1923054)
-    with VirtualBus.pty(box) as bus:
+    with VirtualBus.in_loop(box) as bus:
         flow = await port_step(hass, "evbox", bus.url)
         await flow.choose("search_addresses")
         await flow.submit(IMPOSED | {"serial_numbers": ["1923054"]})
@@ -74,7 +74,7 @@ async def test_evbox_bus_runs_right_after_it_was_added(hass: HomeAssistant) -> N
 async def test_better_name_of_the_same_port_is_taken_without_opening_it_twice(
     hass: HomeAssistant, tmp_path: Path
 ) -> None:
-    with VirtualBus.pty(AblBox(1)) as bus:
+    with VirtualBus.in_loop(AblBox(1)) as bus:
         entry = await setup_bus(
             hass, "abl", bus.url, stored_charger("abl", 1), title="My bus"
         )
@@ -92,7 +92,7 @@ async def test_better_name_of_the_same_port_is_taken_without_opening_it_twice(
 
 
 async def test_running_bus_moves_to_another_port(hass: HomeAssistant) -> None:
-    with VirtualBus.pty(AblBox(1)) as bus, VirtualBus.pty(AblBox(1)) as other:
+    with VirtualBus.in_loop(AblBox(1)) as bus, VirtualBus.in_loop(AblBox(1)) as other:
         entry = await setup_bus(hass, "abl", bus.url, stored_charger("abl", 1))
         flow = await Flow.change_bus(hass, entry)
         await flow.submit({"device": other.url, "line": {"stop_bits": "2"}})
@@ -108,7 +108,7 @@ async def test_running_bus_moves_to_another_port(hass: HomeAssistant) -> None:
 async def test_port_that_cannot_be_opened_leaves_the_bus_running(
     hass: HomeAssistant,
 ) -> None:
-    with VirtualBus.pty(AblBox(1)) as bus:
+    with VirtualBus.in_loop(AblBox(1)) as bus:
         entry = await setup_bus(hass, "abl", bus.url, stored_charger("abl", 1))
         flow = await Flow.change_bus(hass, entry)
         await flow.submit({"device": NOWHERE, "line": {}})
@@ -135,7 +135,7 @@ def bus_entry(hass: HomeAssistant, device: str, **more: object) -> MockConfigEnt
 @pytest.mark.usefixtures("not_set_up")
 async def test_port_is_changed_once_it_can_be_opened(hass: HomeAssistant) -> None:
     entry = bus_entry(hass, NOWHERE, baudrate=9600)
-    with VirtualBus.pty() as bus:
+    with VirtualBus.in_loop() as bus:
         flow = await Flow.change_bus(hass, entry)
         assert flow.step == "reconfigure"
         assert fields(flow) == {
@@ -156,7 +156,7 @@ async def test_port_is_changed_once_it_can_be_opened(hass: HomeAssistant) -> Non
 async def test_own_name_of_a_bus_is_kept(hass: HomeAssistant) -> None:
     entry = bus_entry(hass, NOWHERE)
     hass.config_entries.async_update_entry(entry, title="Car park")
-    with VirtualBus.pty() as bus:
+    with VirtualBus.in_loop() as bus:
         flow = await Flow.change_bus(hass, entry)
         await flow.submit({"device": bus.url, "line": {}})
         assert flow.result["reason"] == "reconfigure_successful"

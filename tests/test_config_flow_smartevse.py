@@ -51,7 +51,7 @@ async def test_box_is_found_in_each_dialect(
     hass: HomeAssistant, dialect: str, unit: int, serial: str | None
 ) -> None:
     box = SmartEvse(dialect, unit=unit, serial=4711)
-    with VirtualBus.pty(box) as bus:
+    with VirtualBus.in_loop(box) as bus:
         flow = await smartevse_step(hass, "polled", bus.url)
         assert flow.step == "scan"
         await flow.wait()
@@ -106,7 +106,7 @@ async def test_box_is_found_in_each_dialect(
 
 
 async def test_line_that_nobody_answers_on(hass: HomeAssistant) -> None:
-    with VirtualBus.pty(baud=9600) as bus:
+    with VirtualBus.in_loop(baud=9600) as bus:
         flow = await smartevse_step(hass, "polled", bus.url)
         await flow.wait()
         assert flow.step == "nothing_found"
@@ -123,7 +123,7 @@ async def test_answers_that_nobody_can_read_may_be_two_boxes(
     hass: HomeAssistant,
 ) -> None:
     box = SmartEvse()
-    with VirtualBus.pty(box) as bus:
+    with VirtualBus.in_loop(box) as bus:
         box.faults.byte_error_rate = 1.0
         flow = await smartevse_step(hass, "polled", bus.url)
         await flow.wait()
@@ -134,7 +134,7 @@ async def test_answers_that_nobody_can_read_may_be_two_boxes(
 
 
 async def test_adapter_unplugged_during_the_search(hass: HomeAssistant) -> None:
-    with VirtualBus.pty(baud=9600) as bus:
+    with VirtualBus.in_loop(baud=9600) as bus:
         flow = await smartevse_step(hass, "polled", bus.url)
         await bus.wait_for_async(lambda: bus.log.total)
         bus.unplug()
@@ -156,7 +156,7 @@ async def test_port_that_is_not_there(hass: HomeAssistant) -> None:
 async def test_box_is_typed_in_without_a_word_on_the_wire(
     hass: HomeAssistant,
 ) -> None:
-    with VirtualBus.pty(baud=9600) as bus:
+    with VirtualBus.in_loop(baud=9600) as bus:
         flow = await smartevse_step(hass, "polled", bus.url)
         await flow.wait()
         said = bus.log.total
@@ -198,7 +198,7 @@ async def test_box_is_typed_in_without_a_word_on_the_wire(
 async def test_charger_form_says_what_is_wrong(
     hass: HomeAssistant, wrong: dict[str, Any], errors: dict[str, str]
 ) -> None:
-    with VirtualBus.pty(baud=9600) as bus:
+    with VirtualBus.in_loop(baud=9600) as bus:
         flow = await smartevse_step(hass, "polled", bus.url)
         await flow.wait()
         await flow.choose("manual")

@@ -38,7 +38,7 @@ async def searched(
 async def test_shared_supply_is_asked_before_anything_is_said(
     hass: HomeAssistant,
 ) -> None:
-    with VirtualBus.pty(baud=9600) as bus:
+    with VirtualBus.in_loop(baud=9600) as bus:
         flow = await smartevse_step(hass, "master", bus.url)
         assert flow.step == "supply"
         assert fields(flow) == {"supply_limit": 16, "supply_minimum": 6}
@@ -69,7 +69,7 @@ async def test_shared_supply_is_asked_before_anything_is_said(
 
 async def test_slaves_are_found_and_added(hass: HomeAssistant) -> None:
     boxes = slave(2), slave(4)
-    with VirtualBus.pty(*boxes) as bus:
+    with VirtualBus.in_loop(*boxes) as bus:
         flow = await searched(hass, bus)
         assert flow.progress == sorted(flow.progress)
         assert flow.progress[-1] == 1
@@ -127,7 +127,7 @@ async def test_slaves_are_found_and_added(hass: HomeAssistant) -> None:
 async def test_no_box_is_offered_more_than_all_of_them_share(
     hass: HomeAssistant,
 ) -> None:
-    with VirtualBus.pty(slave(2)) as bus:
+    with VirtualBus.in_loop(slave(2)) as bus:
         flow = await searched(hass, bus, {"supply_limit": 10, "supply_minimum": 6})
         assert fields(flow)["installation_limit"] == 10
         flow.abort()
@@ -138,7 +138,7 @@ async def test_another_master_is_noticed_and_nothing_is_said(
 ) -> None:
     monkeypatch.setattr(master, "LISTENING", 2.5)
     other, node = SmartEvse(load_balance=1), slave(2)
-    with VirtualBus.pty(other, node) as bus:
+    with VirtualBus.in_loop(other, node) as bus:
         await bus.wait_for_async(lambda: node.broadcasts)
         flow = await searched(hass, bus)
         assert flow.step == "other_master"
@@ -159,7 +159,7 @@ async def test_another_master_is_noticed_and_nothing_is_said(
 async def test_firmware_that_cannot_be_a_slave_is_told(
     hass: HomeAssistant, dialect: str
 ) -> None:
-    with VirtualBus.pty(SmartEvse(dialect, load_balance=3)) as bus:
+    with VirtualBus.in_loop(SmartEvse(dialect, load_balance=3)) as bus:
         flow = await searched(hass, bus)
         assert flow.step == "unsupported"
         assert flow.result["menu_options"] == ["scan", "manual", "port"]
@@ -174,7 +174,7 @@ async def test_firmware_that_cannot_be_a_slave_is_told(
 async def test_the_others_can_be_added_beside_one_that_cannot(
     hass: HomeAssistant,
 ) -> None:
-    with VirtualBus.pty(slave(2), SmartEvse("later", load_balance=3)) as bus:
+    with VirtualBus.in_loop(slave(2), SmartEvse("later", load_balance=3)) as bus:
         flow = await searched(hass, bus)
         assert flow.step == "unsupported"
         assert flow.result["menu_options"] == ["select", "scan", "manual", "port"]
@@ -185,7 +185,7 @@ async def test_the_others_can_be_added_beside_one_that_cannot(
 
 async def test_two_boxes_with_one_unit_are_told(hass: HomeAssistant) -> None:
     twins = slave(2, name="one"), slave(2, name="other", cable=32, min_current=10)
-    with VirtualBus.pty(*twins, slave(3)) as bus:
+    with VirtualBus.in_loop(*twins, slave(3)) as bus:
         flow = await searched(hass, bus)
         assert flow.step == "duplicates"
         assert flow.tells("at 2 on", "a number of its own")
@@ -195,7 +195,7 @@ async def test_two_boxes_with_one_unit_are_told(hass: HomeAssistant) -> None:
 
 
 async def test_slaves_are_typed_in(hass: HomeAssistant) -> None:
-    with VirtualBus.pty(baud=9600) as bus:
+    with VirtualBus.in_loop(baud=9600) as bus:
         flow = await searched(hass, bus)
         assert flow.step == "nothing_found"
         await flow.choose("manual")
@@ -215,7 +215,7 @@ async def test_slaves_are_typed_in(hass: HomeAssistant) -> None:
 
 
 async def test_shared_supply_typed_once_is_offered_again(hass: HomeAssistant) -> None:
-    with VirtualBus.pty(baud=9600) as bus:
+    with VirtualBus.in_loop(baud=9600) as bus:
         flow = await searched(hass, bus)
         await flow.choose("port")
         await flow.submit({"device": bus.url, "line": {}})

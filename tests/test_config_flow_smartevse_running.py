@@ -30,7 +30,7 @@ async def test_polled_box_stops_with_home_assistant_if_that_was_chosen(
 ) -> None:
     car = Car(max_current=16, reaction=0.1)
     box = SmartEvse("2.20", unit=1, car=car, max_current=16)
-    with VirtualBus.pty(box) as bus:
+    with VirtualBus.in_loop(box) as bus:
         car.plug_in()
         await bus.wait_for_async(lambda: box.contactor)
         flow = await smartevse_step(hass, "polled", bus.url)
@@ -56,7 +56,7 @@ async def test_slaves_hear_their_master_and_share_what_was_chosen(
     boxes = tuple(
         SmartEvse(load_balance=unit, car=car) for unit, car in enumerate(cars, 2)
     )
-    with VirtualBus.pty(*boxes) as bus:
+    with VirtualBus.in_loop(*boxes) as bus:
         flow = await smartevse_step(hass, "master", bus.url)
         await flow.submit({"supply_limit": 15, "supply_minimum": 6})
         await flow.wait()

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.usefixtures("quick_search")
 
 @pytest.mark.usefixtures("not_set_up")
 async def test_two_dialogues_for_one_port(hass: HomeAssistant) -> None:
-    with VirtualBus.pty(AblBox(1)) as bus:
+    with VirtualBus.in_loop(AblBox(1)) as bus:
         first = await port_step(hass, "abl", bus.url)
         await first.wait()
         second = await port_step(hass, "abl", bus.url)
@@ -29,7 +29,7 @@ async def test_two_dialogues_for_one_port(hass: HomeAssistant) -> None:
 
 @pytest.mark.usefixtures("not_set_up")
 async def test_a_search_beside_a_search_on_one_port(hass: HomeAssistant) -> None:
-    with VirtualBus.pty(AblBox(1)) as bus:
+    with VirtualBus.in_loop(AblBox(1)) as bus:
         first = await port_step(hass, "abl", bus.url)
         await bus.wait_for_async(lambda: bus.log.total)
         second = await port_step(hass, "abl", bus.url)
@@ -45,7 +45,7 @@ async def test_two_dialogues_for_one_charger(
     hass: HomeAssistant, second_is: str
 ) -> None:
     """Two chargers at one address would set limits of one box."""
-    with VirtualBus.pty(AblBox(1), AblBox(2, serial="2W22xy00000002")) as bus:
+    with VirtualBus.in_loop(AblBox(1), AblBox(2, serial="2W22xy00000002")) as bus:
         entry = await setup_bus(hass, "abl", bus.url, stored_charger("abl", 1))
         first = await Flow.add_charger(hass, entry)
         await first.choose("manual")

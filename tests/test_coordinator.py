@@ -33,7 +33,7 @@ def issue(hass: HomeAssistant, key: str) -> ir.IssueEntry | None:
 
 async def test_someone_elses_charger_answers(hass: HomeAssistant) -> None:
     box = AblBox(1, serial="2W22xy00000009")
-    with VirtualBus.pty(box) as bus:
+    with VirtualBus.in_loop(box) as bus:
         entry = await setup_bus(
             hass, "abl", bus.url, charger("abl", 1, serial="2W22xy00000001")
         )
@@ -57,7 +57,7 @@ async def test_someone_elses_charger_answers(hass: HomeAssistant) -> None:
 async def test_a_chargepoint_swapped_for_another(hass: HomeAssistant) -> None:
     """Addressed as "whoever is there", another one must not get the orders."""
     box = EvboxChargePoint(1923054, 1, min_interval=0)
-    with VirtualBus.pty(box) as bus:
+    with VirtualBus.in_loop(box) as bus:
         entry = await setup_bus(
             hass, "evbox", bus.url, charger("evbox", 0, poll_interval=0.5)
         )
@@ -85,7 +85,7 @@ async def test_a_chargepoint_swapped_for_another(hass: HomeAssistant) -> None:
 
 async def test_two_boxes_with_one_id(hass: HomeAssistant) -> None:
     one, two = AblBox(1), AblBox(1, serial="2W22xy00000002")
-    with VirtualBus.pty(one, two) as bus:
+    with VirtualBus.in_loop(one, two) as bus:
         entry = await setup_bus(hass, "abl", bus.url, charger("abl", 1))
         await wait_until(hass, lambda: issue(hass, "duplicate_address_abl1"))
         assert not one.writes
@@ -113,7 +113,7 @@ async def test_a_timeout_too_short_for_the_interval(hass: HomeAssistant) -> None
 
 async def test_issues_go_with_the_charger(hass: HomeAssistant) -> None:
     box = AblBox(1, serial="2W22xy00000009")
-    with VirtualBus.pty(box) as bus:
+    with VirtualBus.in_loop(box) as bus:
         entry = await setup_bus(
             hass, "abl", bus.url, charger("abl", 1, serial="2W22xy00000001")
         )
@@ -129,7 +129,7 @@ async def test_a_serial_number_that_another_charger_has_is_not_bound(
     hass: HomeAssistant, key: str
 ) -> None:
     box = AblBox(1, serial="2W22xy00000001")
-    with VirtualBus.pty(box) as bus:
+    with VirtualBus.in_loop(box) as bus:
         entry = await setup_bus(
             hass,
             "abl",

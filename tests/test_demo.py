@@ -43,6 +43,8 @@ from .virtual import (
     VirtualBus,
 )
 
+pytestmark = pytest.mark.real_time
+
 # -- The first start, without frontend -------------------------------------------
 
 

@@ -91,7 +91,7 @@ def test_an_address_to_listen_on_has_words_of_its_own() -> None:
 async def test_a_platform_that_fails_does_not_keep_the_port(
     hass: HomeAssistant,
 ) -> None:
-    with VirtualBus.pty(AblBox(1)) as bus:
+    with VirtualBus.in_loop(AblBox(1)) as bus:
         with patch.object(
             ConfigEntries, "async_forward_entry_setups", side_effect=RuntimeError
         ):

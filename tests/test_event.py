@@ -51,6 +51,8 @@ async def test_a_charge_begins_and_ends(hass: HomeAssistant) -> None:
     async with running(hass, box, time_scale=4) as (entry, bus):
         charge = await get_entity(hass, "event", entry, "1_charge")
         allowed = await get_entity(hass, "switch", entry, "1_charging_allowed")
+        status = await get_entity(hass, "sensor", entry, "1_status")
+        await wait_for_state(hass, status, "preparing")
         await hass.services.async_call(
             "switch", "turn_on", {"entity_id": allowed}, blocking=True
         )

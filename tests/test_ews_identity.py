@@ -57,7 +57,7 @@ async def test_another_box_is_told_nothing(
     quick = replace(EwsReader.timing, backoff=0.3, backoff_limit=0.3)
     monkeypatch.setattr(EwsReader, "timing", quick)
     box = EwsBox(serial=OTHER, cars=(quick_car(),))
-    with VirtualBus.pty(box) as bus:
+    with VirtualBus.in_loop(box) as bus:
         entry = await setup_bus(hass, "ews", bus.url, box_of(SERIAL))
         problem = await get_entity(hass, "binary_sensor", entry, "1_problem")
         await wait_for_state(hass, problem, "on")

@@ -163,12 +163,13 @@ async def test_a_reload_and_an_unload_leave_nothing_behind(
         status = await get_entity(hass, "sensor", entry, "1_status")
         assert tasks() == {"bus Yard"}
         with dialler_of(entry, stranger) as other:
-            await other.wait_for_async(lambda: stranger.link_up)
+            await other.wait_for_async(lambda: stranger.requests)
+            asked = stranger.requests
             await hass.config_entries.async_reload(entry.entry_id)
             await wait_for_state(hass, status, "available")
             assert tasks() == {"bus Yard"}
             await other.wait_for_async(
-                lambda: stranger.link_up and other.dial_port.opened == 2
+                lambda: stranger.requests > asked and other.dial_port.opened == 2
             )
             await hass.config_entries.async_unload(entry.entry_id)
             assert entry.state is ConfigEntryState.NOT_LOADED

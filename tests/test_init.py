@@ -79,7 +79,7 @@ async def test_a_port_that_is_not_there(hass: HomeAssistant) -> None:
 
 
 async def test_a_port_that_is_in_use(hass: HomeAssistant) -> None:
-    with VirtualBus.pty(AblBox(1)) as bus:
+    with VirtualBus.in_loop(AblBox(1)) as bus:
         first = await setup_bus(hass, "abl", bus.url, charger("abl", 1))
         second = bus_entry("abl", bus.url, entry_id="second")
         second.add_to_hass(hass)
@@ -125,7 +125,7 @@ async def test_a_network_port_that_refuses(hass: HomeAssistant) -> None:
 
 
 async def test_unloading_leaves_nothing_open(hass: HomeAssistant) -> None:
-    with VirtualBus.pty(AblBox(1), AblBox(2)) as bus:
+    with VirtualBus.in_loop(AblBox(1), AblBox(2)) as bus:
         before = open_files()
         entry = await setup_bus(
             hass, "abl", bus.url, charger("abl", 1), charger("abl", 2)
@@ -167,7 +167,7 @@ async def test_stopping_home_assistant_closes_the_port(hass: HomeAssistant) -> N
 async def test_removal_leaves_nothing(
     hass: HomeAssistant, hass_storage: dict[str, Any]
 ) -> None:
-    with VirtualBus.pty(AblBox(1)) as bus:
+    with VirtualBus.in_loop(AblBox(1)) as bus:
         entry = await setup_bus(hass, "abl", bus.url, charger("abl", 1))
         await get_entity(hass, "sensor", entry, "1_status")
         assert "evse_bus.bus" in hass_storage
@@ -189,7 +189,7 @@ async def test_a_charger_is_added_and_removed_while_the_others_go_on(
     hass: HomeAssistant, hass_storage: dict[str, Any]
 ) -> None:
     one, two = AblBox(1), AblBox(2, serial="2W22xy00000002")
-    with VirtualBus.pty(one, two) as bus:
+    with VirtualBus.in_loop(one, two) as bus:
         entry = await setup_bus(hass, "abl", bus.url, charger_of(one))
         first = await get_entity(hass, "sensor", entry, "1_status")
         coordinator = entry.runtime_data
@@ -263,7 +263,7 @@ async def test_a_new_name_of_the_bus(hass: HomeAssistant) -> None:
 
 async def test_a_new_address_makes_the_charger_anew(hass: HomeAssistant) -> None:
     box = AblBox(2, serial="2W22xy00000002")
-    with VirtualBus.pty(box) as bus:
+    with VirtualBus.in_loop(box) as bus:
         entry = await setup_bus(
             hass, "abl", bus.url, charger("abl", 1, serial=box.serial)
         )
@@ -281,7 +281,7 @@ async def test_a_new_address_makes_the_charger_anew(hass: HomeAssistant) -> None
 
 
 async def test_a_new_port_reloads_the_bus(hass: HomeAssistant) -> None:
-    with VirtualBus.pty(AblBox(1)) as old, VirtualBus.pty(AblBox(1)) as new:
+    with VirtualBus.in_loop(AblBox(1)) as old, VirtualBus.in_loop(AblBox(1)) as new:
         entry = await setup_bus(hass, "abl", old.url, charger("abl", 1))
         status = await get_entity(hass, "sensor", entry, "1_status")
         before = entry.runtime_data
@@ -305,7 +305,7 @@ async def test_a_charger_that_nobody_had_a_serial_number_for(
     hass: HomeAssistant,
 ) -> None:
     box = AblBox(1, serial="2W22xy00000001")
-    with VirtualBus.pty(box) as bus:
+    with VirtualBus.in_loop(box) as bus:
         entry = await setup_bus(hass, "abl", bus.url, charger("abl", 1))
         status = await get_entity(hass, "sensor", entry, "1_status")
         await hass.async_block_till_done()

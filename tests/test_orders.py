@@ -186,7 +186,7 @@ async def test_lost_orders_become_the_fail_safe_and_are_told(
     hass: HomeAssistant, hass_storage: dict[str, Any], damaged: dict[str, Any] | None
 ) -> None:
     box = AblBox(1)
-    with VirtualBus.pty(box) as bus:
+    with VirtualBus.in_loop(box) as bus:
         entry = await setup_bus(
             hass, "abl", bus.url, charger_of(box, fail_safe_current=6.5)
         )

@@ -55,7 +55,7 @@ async def test_orders_are_read_before_the_port_is_opened(hass: HomeAssistant) ->
             await read.wait()
         return await original(self)
 
-    with VirtualBus.pty(AblBox(1)) as bus, patch.object(Store, "async_load", slow):
+    with VirtualBus.in_loop(AblBox(1)) as bus, patch.object(Store, "async_load", slow):
         entry = bus_entry("abl", bus.url, charger("abl", 1))
         entry.add_to_hass(hass)
         setting_up = hass.async_create_task(
@@ -78,7 +78,7 @@ async def test_an_evbox_hears_its_orders_first_after_a_crash(
     """In the middle of a charge."""
     car = Car(reaction=0.0, ramp=0.1)
     box = EvboxChargePoint(1923054, [Module(car)], min_interval=0)
-    with VirtualBus.pty(box) as bus:
+    with VirtualBus.in_loop(box) as bus:
         car.plug_in()
         entry = await setup_bus(
             hass, "evbox", bus.url, charger_of(box, poll_interval=0.3)
@@ -115,7 +115,7 @@ async def test_an_abl_box_is_lowered_after_a_crash(
     """A raise that was not stored yet is lost: lower is what remains."""
     car = Car(reaction=0.0, ramp=0.1)
     box = AblBox(1, car=car)
-    with VirtualBus.pty(box) as bus:
+    with VirtualBus.in_loop(box) as bus:
         car.plug_in()
         entry = await setup_bus(hass, "abl", bus.url, charger_of(box))
         limit = await get_entity(hass, "number", entry, "charging_current")
@@ -170,7 +170,7 @@ async def test_the_adapter_is_plugged_in_after_the_start(
     name = tmp_path / "usb-adapter"
     entry = await setup_bus(hass, "abl", str(name), charger("abl", 1))
     assert entry.state is ConfigEntryState.SETUP_RETRY
-    with VirtualBus.pty(AblBox(1)) as bus:
+    with VirtualBus.in_loop(AblBox(1)) as bus:
         name.symlink_to(bus.url)
         async_fire_time_changed(hass, dt_util.utcnow() + timedelta(minutes=5))
         await get_entity(hass, "sensor", entry, "1_status")

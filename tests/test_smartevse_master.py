@@ -303,7 +303,7 @@ async def test_a_reload_does_not_stop_them(hass: HomeAssistant) -> None:
 async def test_another_master(hass: HomeAssistant) -> None:
     boxes = slaves(1)
     other = SmartEvse(load_balance=1)
-    with VirtualBus.pty(*boxes, time_scale=4) as bus:
+    with VirtualBus.in_loop(*boxes, time_scale=4) as bus:
         entry = await setup_bus(
             hass, "smartevse_master", bus.url, charger("smartevse_master", 2), **SUPPLY
         )
@@ -337,7 +337,7 @@ async def test_the_issue_of_another_master_goes_with_the_bus(
     hass: HomeAssistant,
 ) -> None:
     boxes = (*slaves(1), SmartEvse(load_balance=1))
-    with VirtualBus.pty(*boxes, time_scale=4) as bus:
+    with VirtualBus.in_loop(*boxes, time_scale=4) as bus:
         entry = await setup_bus(
             hass, "smartevse_master", bus.url, charger("smartevse_master", 2), **SUPPLY
         )

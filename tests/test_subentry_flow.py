@@ -51,7 +51,7 @@ async def take_down(hass: HomeAssistant, entry: MockConfigEntry) -> None:
 async def test_new_box_is_found_while_the_others_are_polled(
     hass: HomeAssistant,
 ) -> None:
-    with VirtualBus.pty(abl(1), abl(2)) as bus:
+    with VirtualBus.in_loop(abl(1), abl(2)) as bus:
         entry = await abl_bus(hass, bus, 1)
         running = entry.runtime_data.bus
         flow = await Flow.add_charger(hass, entry)
@@ -96,7 +96,7 @@ async def test_new_box_is_found_while_the_others_are_polled(
 
 
 async def test_nothing_new_on_the_bus(hass: HomeAssistant) -> None:
-    with VirtualBus.pty(abl(1)) as bus:
+    with VirtualBus.in_loop(abl(1)) as bus:
         entry = await abl_bus(hass, bus, 1)
         flow = await Flow.add_charger(hass, entry)
         await flow.choose("scan")
@@ -117,7 +117,7 @@ async def test_nothing_new_on_the_bus(hass: HomeAssistant) -> None:
 
 async def test_two_new_boxes_with_one_id(hass: HomeAssistant) -> None:
     twins = AblBox(2, serial=serial(21)), AblBox(2, serial=serial(22))
-    with VirtualBus.pty(abl(1), *twins) as bus:
+    with VirtualBus.in_loop(abl(1), *twins) as bus:
         entry = await abl_bus(hass, bus, 1)
         flow = await Flow.add_charger(hass, entry)
         await flow.choose("scan")
@@ -132,7 +132,7 @@ async def test_two_new_boxes_with_one_id(hass: HomeAssistant) -> None:
 async def test_box_found_at_another_address_is_the_same_box(
     hass: HomeAssistant,
 ) -> None:
-    with VirtualBus.pty(AblBox(5, serial=serial(1))) as bus:
+    with VirtualBus.in_loop(AblBox(5, serial=serial(1))) as bus:
         entry = await abl_bus(hass, bus, 1)
         flow = await Flow.add_charger(hass, entry)
         await flow.choose("scan")
@@ -145,7 +145,7 @@ async def test_box_found_at_another_address_is_the_same_box(
 
 
 async def test_adapter_unplugged_during_the_search(hass: HomeAssistant) -> None:
-    with VirtualBus.pty(abl(1)) as bus:
+    with VirtualBus.in_loop(abl(1)) as bus:
         entry = await abl_bus(hass, bus, 1)
         flow = await Flow.add_charger(hass, entry)
         await flow.choose("scan")
@@ -158,7 +158,7 @@ async def test_adapter_unplugged_during_the_search(hass: HomeAssistant) -> None:
 
 
 async def test_bus_taken_down_before_the_search(hass: HomeAssistant) -> None:
-    with VirtualBus.pty(abl(1)) as bus:
+    with VirtualBus.in_loop(abl(1)) as bus:
         entry = await abl_bus(hass, bus, 1)
         flow = await Flow.add_charger(hass, entry)
         await take_down(hass, entry)
@@ -172,7 +172,7 @@ async def test_bus_taken_down_before_the_search(hass: HomeAssistant) -> None:
 async def test_closing_the_dialogue_in_mid_search_leaves_the_bus_running(
     hass: HomeAssistant,
 ) -> None:
-    with VirtualBus.pty(abl(1)) as bus:
+    with VirtualBus.in_loop(abl(1)) as bus:
         entry = await abl_bus(hass, bus, 1)
         flow = await Flow.add_charger(hass, entry)
         await flow.choose("scan")
@@ -204,7 +204,7 @@ async def test_charger_is_added_to_a_bus_that_is_not_running(
 
 async def test_evbox_is_added_without_a_search(hass: HomeAssistant) -> None:
     first, second = EvboxChargePoint(1923054), EvboxChargePoint(777)
-    with VirtualBus.pty(first, second) as bus:
+    with VirtualBus.in_loop(first, second) as bus:
         known = stored_charger("evbox", 1923054, serial="1923054")
         entry = await setup_bus(hass, "evbox", bus.url, known)
         flow = await Flow.add_charger(hass, entry)
@@ -262,7 +262,7 @@ def changed(**more: object) -> dict[str, Any]:
 
 
 async def test_abl_charger_is_changed_in_place(hass: HomeAssistant) -> None:
-    with VirtualBus.pty(abl(1), abl(2)) as bus:
+    with VirtualBus.in_loop(abl(1), abl(2)) as bus:
         entry = await abl_bus(hass, bus, 1, 2)
         one = get(entry, "Charger 1")
         flow = await Flow.change_charger(hass, entry, one)

@@ -174,7 +174,7 @@ async def test_one_box_on_a_serial_line(hass: HomeAssistant) -> None:
 
 
 async def test_serial_line_without_a_box_is_searched(hass: HomeAssistant) -> None:
-    with VirtualBus.pty(EwsBox(serial=SERIAL, jumper=10)) as bus:
+    with VirtualBus.in_loop(EwsBox(serial=SERIAL, jumper=10)) as bus:
         entry = await setup_bus(hass, "ews", bus.url)
         flow = await Flow.add_charger(hass, entry)
         assert flow.step == "user"

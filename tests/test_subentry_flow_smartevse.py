@@ -49,7 +49,7 @@ async def take_down(hass: HomeAssistant, entry: MockConfigEntry) -> None:
 
 async def test_searches_leave_the_broadcasts_in_time(hass: HomeAssistant) -> None:
     box = slave(2)
-    with VirtualBus.pty(box, slave(3)) as bus:
+    with VirtualBus.in_loop(box, slave(3)) as bus:
         entry = await master_bus(hass, bus.url, 2)
         await bus.wait_for_async(lambda: box.broadcasts)
         while len(box.broadcasts) < 3:
@@ -67,7 +67,7 @@ async def test_searches_leave_the_broadcasts_in_time(hass: HomeAssistant) -> Non
 
 async def test_slave_is_added_to_a_bus_that_runs(hass: HomeAssistant) -> None:
     first, second = slave(2), slave(3)
-    with VirtualBus.pty(first, second) as bus:
+    with VirtualBus.in_loop(first, second) as bus:
         entry = await master_bus(hass, bus.url, 2)
         running = entry.runtime_data.bus
         await bus.wait_for_async(lambda: first.broadcasts)
@@ -103,7 +103,7 @@ async def test_slave_is_added_to_a_bus_that_runs(hass: HomeAssistant) -> None:
 
 
 async def test_slave_that_is_there_already_is_refused(hass: HomeAssistant) -> None:
-    with VirtualBus.pty(slave(2)) as bus:
+    with VirtualBus.in_loop(slave(2)) as bus:
         entry = await master_bus(hass, bus.url, 2)
         flow = await Flow.add_charger(hass, entry)
         await flow.choose("scan")
@@ -122,7 +122,7 @@ async def test_slave_that_is_there_already_is_refused(hass: HomeAssistant) -> No
 
 
 async def test_slave_with_another_firmware_is_told(hass: HomeAssistant) -> None:
-    with VirtualBus.pty(slave(2), SmartEvse("later", load_balance=3)) as bus:
+    with VirtualBus.in_loop(slave(2), SmartEvse("later", load_balance=3)) as bus:
         entry = await master_bus(hass, bus.url, 2)
         flow = await Flow.add_charger(hass, entry)
         await flow.choose("scan")
@@ -136,7 +136,7 @@ async def test_slave_with_another_firmware_is_told(hass: HomeAssistant) -> None:
 
 async def test_search_beside_another_master(hass: HomeAssistant) -> None:
     first = slave(2)
-    with VirtualBus.pty(first) as bus:
+    with VirtualBus.in_loop(first) as bus:
         entry = await master_bus(hass, bus.url, 2)
         await bus.wait_for_async(lambda: first.broadcasts)
         bus.add(SmartEvse(load_balance=1))
@@ -204,7 +204,7 @@ async def test_two_dialogues_add_one_box_to_a_bus_that_polls(
 async def test_box_is_searched_on_a_bus_that_has_lost_its_own(
     hass: HomeAssistant,
 ) -> None:
-    with VirtualBus.pty(SmartEvse()) as bus:
+    with VirtualBus.in_loop(SmartEvse()) as bus:
         entry = await setup_bus(hass, "smartevse", bus.url)
         flow = await Flow.add_charger(hass, entry)
         await flow.choose("scan")
@@ -225,7 +225,7 @@ async def test_box_is_searched_on_a_bus_that_has_lost_its_own(
 
 async def test_polled_box_is_changed_in_place(hass: HomeAssistant) -> None:
     box = SmartEvse("later", serial=4711)
-    with VirtualBus.pty(box) as bus:
+    with VirtualBus.in_loop(box) as bus:
         stored = stored_charger("smartevse", 1, serial="4711", title="Box")
         entry = await setup_bus(hass, "smartevse", bus.url, stored)
         flow = await Flow.change_charger(hass, entry, get(entry, "Box"))
@@ -270,7 +270,7 @@ async def test_polled_box_is_changed_in_place(hass: HomeAssistant) -> None:
 
 async def test_slave_is_changed_in_place(hass: HomeAssistant) -> None:
     first, second = slave(2), slave(3)
-    with VirtualBus.pty(first, second) as bus:
+    with VirtualBus.in_loop(first, second) as bus:
         entry = await master_bus(hass, bus.url, 2, 3)
         flow = await Flow.change_charger(hass, entry, get(entry, "Charger 3"))
         assert fields(flow)["slave"] == "3"
@@ -298,7 +298,7 @@ async def test_shared_supply_is_changed_while_the_slaves_hear_their_master(
     hass: HomeAssistant,
 ) -> None:
     box = slave(2)
-    with VirtualBus.pty(box) as bus:
+    with VirtualBus.in_loop(box) as bus:
         entry = await master_bus(hass, bus.url, 2)
         await bus.wait_for_async(lambda: box.broadcasts)
         flow = await Flow.change_bus(hass, entry)

@@ -1,14 +1,9 @@
-"""A bus in simulated time: no byte moves and no second passes for real.
-
-The event loop's clock jumps to the next timer whenever nothing else is to be
-done, so that an hour of bus takes milliseconds and every run is the same.
-"""
+"""A bus in simulated time: no byte moves and no second passes for real."""
 
 import asyncio
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from dataclasses import dataclass, field
-import selectors
-from typing import Any, ClassVar, Self, override
+from typing import ClassVar, Self, override
 
 from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.charger import Charger
@@ -32,53 +27,10 @@ from custom_components.evse_bus.evse.model import (
 )
 from custom_components.evse_bus.evse.readings import ChargerReading
 from custom_components.evse_bus.evse.safety import clamp
+from tests.simulated_time import now
 
 SETTINGS = LineSettings(baudrate=38400)
 TIMING = Timing(reply_timeout=0.25, longest_reply=40, silence=0.0)
-
-
-class _JumpingSelector(selectors.SelectSelector):
-    """Does not wait: says how long it would have waited."""
-
-    def __init__(self, advance: Callable[[float], None]) -> None:
-        super().__init__()
-        self._advance = advance
-
-    @override
-    def select(self, timeout: float | None = None) -> Any:
-        if timeout is None:
-            message = "everybody waits for nothing"
-            raise RuntimeError(message)
-        events = super().select(0)
-        # A little more than asked for, as with a real clock: a timer may fire
-        # within the clock's resolution before its time, for ever if time stood.
-        self._advance(timeout + 1e-9)
-        return events
-
-
-class SimulatedLoop(asyncio.SelectorEventLoop):
-    """An event loop with a clock of its own."""
-
-    def __init__(self) -> None:
-        self.now = 1000.0
-        super().__init__(_JumpingSelector(self._advance))
-
-    def _advance(self, seconds: float) -> None:
-        self.now += seconds
-
-    @override
-    def time(self) -> float:
-        return self.now
-
-
-def simulate[T](scene: Coroutine[Any, Any, T]) -> T:
-    """Run a scene in simulated time and return its result."""
-    with asyncio.Runner(loop_factory=SimulatedLoop) as runner:
-        return runner.run(scene)
-
-
-def now() -> float:
-    return asyncio.get_running_loop().time()
 
 
 class Telegram(Frame):

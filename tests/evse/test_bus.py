@@ -20,8 +20,9 @@ from custom_components.evse_bus.evse.errors import (
 )
 from custom_components.evse_bus.evse.exchange import Turn
 from custom_components.evse_bus.evse.model import OrderChange, Persistence
+from tests.simulated_time import now, simulate
 
-from .simulated import TIMING, Device, Scene, SimulatedLine, now, simulate
+from .simulated import TIMING, Device, Scene, SimulatedLine
 
 
 def test_polls_each_charger_at_its_interval() -> None:

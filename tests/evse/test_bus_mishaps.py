@@ -22,8 +22,9 @@ from custom_components.evse_bus.evse.statistics import (
     Direction,
     FrameLog,
 )
+from tests.simulated_time import simulate
 
-from .simulated import Scene, SimulatedCharger, SimulatedLine, simulate
+from .simulated import Scene, SimulatedCharger, SimulatedLine
 
 
 class SlowCharger(SimulatedCharger):

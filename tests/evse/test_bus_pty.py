@@ -12,6 +12,8 @@ from custom_components.evse_bus.evse.model import CurrentLimit, OrderChange, Ord
 from custom_components.evse_bus.evse.protocols import PROTOCOLS
 from tests.virtual import AblBox, Request, VirtualBus, requests_in
 
+pytestmark = pytest.mark.real_time
+
 ABL = PROTOCOLS["abl"]
 LIMIT = 0x14
 CURRENT = 0x2E

@@ -24,6 +24,8 @@ from custom_components.evse_bus.evse.errors import (
 from custom_components.evse_bus.evse.framing import LineSettings
 from custom_components.evse_bus.evse.line import Line, line_error
 
+pytestmark = pytest.mark.real_time
+
 SETTINGS = LineSettings(baudrate=38400)
 
 

@@ -10,7 +10,7 @@ from .device import REPEAT_GAP
 from .faults import Faults
 from .log import CLIENT, INJECTED, NOISE, Entry, TrafficLog
 from .loop import LoopThread
-from .ports import Port, PtyPort, TcpPort
+from .ports import DirectPort, Port, PtyPort, TcpPort
 from .wire import Wire
 
 if TYPE_CHECKING:
@@ -51,9 +51,10 @@ class VirtualBus(LoopThread):
         granularity: float = 0.002,
         seed: int = 0,
         ring: int | None = 20_000,
+        own_thread: bool = True,
     ) -> None:
         """Prepare a bus; `start` or `with` brings it to life."""
-        super().__init__("virtual-bus")
+        super().__init__("virtual-bus", own_thread=own_thread)
         lines = {(d.baud, d.parity) for d in devices} or {(38400, "N")}
         if len(lines) > 1 and (baud is None or parity is None):
             msg = "devices of different line settings on one bus: say baud and parity"
@@ -110,6 +111,15 @@ class VirtualBus(LoopThread):
             return TcpPort(bus.loop, bus.wire.send_client, port)
 
         return cls(devices, make, **options)  # type: ignore[arg-type]
+
+    @classmethod
+    def in_loop(cls, *devices: Device, **options: float | str | None) -> VirtualBus:
+        """Make a bus that lives on the running loop, on a `DirectPort`."""
+
+        def make(bus: VirtualBus) -> Port:
+            return DirectPort(bus.wire.send_client)
+
+        return cls(devices, make, own_thread=False, **options)  # type: ignore[arg-type]
 
     # Life
 

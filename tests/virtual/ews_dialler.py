@@ -136,15 +136,7 @@ class EwsDialler(VirtualBus):
         if self._thread_of is None:
             super().start_thread()
         else:
-            self._loop = self._thread_of._loop
-            self._thread = self._thread_of._thread
-
-    def stop_thread(self) -> None:
-        """Stop the thread, if it is its own."""
-        if self._thread_of is None:
-            super().stop_thread()
-        else:
-            self._loop = self._thread = None
+            self.share_thread(self._thread_of)
 
     # Inside
 

@@ -12,7 +12,8 @@ import contextlib
 import selectors
 import threading
 import time
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
+import weakref
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -42,6 +43,44 @@ class PreciseLoop(asyncio.SelectorEventLoop):
         return self._clock()
 
 
+class BorrowedLoop:
+    """Somebody else's loop that a bus lives on: its timers end with the bus."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop | BorrowedLoop) -> None:
+        """Borrow a loop."""
+        self._loop = loop
+        self._timers: weakref.WeakSet[asyncio.TimerHandle] = weakref.WeakSet()
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - of the loop
+        """Return anything else of the loop."""
+        return getattr(self._loop, name)
+
+    def call_at(
+        self,
+        when: float,
+        callback: Callable[..., object],
+        *args: Any,  # noqa: ANN401 - as of a loop
+    ) -> asyncio.TimerHandle:
+        """Call something at a time, unless the loop is given back before."""
+        timer = self._loop.call_at(when, callback, *args)
+        self._timers.add(timer)
+        return timer
+
+    def call_later(
+        self,
+        delay: float,
+        callback: Callable[..., object],
+        *args: Any,  # noqa: ANN401 - as of a loop
+    ) -> asyncio.TimerHandle:
+        """Call something after a time, unless the loop is given back before."""
+        return self.call_at(self._loop.time() + delay, callback, *args)
+
+    def give_back(self) -> None:
+        """End all timers."""
+        for timer in tuple(self._timers):
+            timer.cancel()
+
+
 class _Waiter:
     """Somebody waiting until a condition holds."""
 
@@ -55,16 +94,20 @@ class _Waiter:
 class LoopThread:
     """A thread with a loop, calls into it, and waiters on its state."""
 
-    def __init__(self, name: str) -> None:
-        """Prepare; nothing runs before `start_thread`."""
+    def __init__(self, name: str, *, own_thread: bool = True) -> None:
+        """Prepare; nothing runs before `start_thread`.
+
+        Without an `own_thread` it lives on the loop of its caller, in its time.
+        """
         self._thread_name = name
         self._thread: threading.Thread | None = None
-        self._loop: PreciseLoop | None = None
+        self._loop: PreciseLoop | BorrowedLoop | None = None
+        self._own_thread = own_thread
         self._waiters: list[_Waiter] = []
         self.errors: list[BaseException] = []
 
     @property
-    def loop(self) -> PreciseLoop:
+    def loop(self) -> PreciseLoop | BorrowedLoop:
         """Return the running loop."""
         if self._loop is None:
             msg = "the virtual bus is not running"
@@ -78,6 +121,10 @@ class LoopThread:
 
     def start_thread(self) -> None:
         """Start the thread and wait until its loop runs."""
+        if not self._own_thread:
+            self._loop = BorrowedLoop(asyncio.get_running_loop())
+            self._thread = threading.current_thread()
+            return
         loop = PreciseLoop()
         loop.set_exception_handler(self._on_error)
         ready = threading.Event()
@@ -96,15 +143,23 @@ class LoopThread:
         ready.wait()
         self._loop = loop
 
+    def share_thread(self, other: LoopThread) -> None:
+        """Live on the thread of another."""
+        self._loop = BorrowedLoop(other.loop)
+        self._thread = other._thread
+
     def stop_thread(self) -> None:
         """Stop the loop, end the waiters, join the thread."""
         loop, thread = self._loop, self._thread
         if loop is None or thread is None:
             return
-        with contextlib.suppress(RuntimeError):
-            loop.call_soon_threadsafe(loop.stop)
-        # Until it has really ended, what is due there may still need the loop.
-        thread.join(CALL_TIMEOUT)
+        if isinstance(loop, BorrowedLoop):
+            self.call(loop.give_back)
+        else:
+            with contextlib.suppress(RuntimeError):
+                loop.call_soon_threadsafe(loop.stop)
+            # Until it has really ended, what is due there may still need the loop.
+            thread.join(CALL_TIMEOUT)
         self._loop = None
         self._thread = None
         for waiter in self._waiters:
@@ -184,6 +239,9 @@ class LoopThread:
             self._waiters.append(waiter)
             self.check_waiters()
 
+        if not self._own_thread:
+            begin()
+            return waiter.future
         if threading.current_thread() is self._thread:
             msg = "the bus thread cannot wait for itself"
             raise RuntimeError(msg)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import errno
+import itertools
 import os
 from pathlib import Path
 import select
@@ -10,10 +13,9 @@ import shutil
 import socket
 import tempfile
 import termios
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, ClassVar, Protocol
 
 if TYPE_CHECKING:
-    import asyncio
     from collections.abc import Callable
 
 READ_SIZE = 4096
@@ -198,6 +200,105 @@ class PtyPort:
         if self._reading:
             self._reading = False
             self._loop.remove_reader(self._master)
+
+
+class DirectTransport:
+    """A client's end of a `DirectPort`, as of a serial port that is open."""
+
+    def __init__(self, port: DirectPort, protocol: asyncio.Protocol) -> None:
+        """Take what the client hears with."""
+        self.protocol = protocol
+        self._port = port
+        self._closed = asyncio.get_running_loop().create_future()
+
+    def write(self, data: bytes) -> None:
+        """Send bytes, at once as a driver takes them."""
+        if self._port.client is self:
+            self._port.on_bytes(bytes(data))
+
+    def close(self) -> None:
+        """Close; the client is told soon."""
+        self.end(None)
+
+    async def wait_closed(self) -> None:
+        """Wait until it is closed."""
+        await self._closed
+
+    def end(self, error: Exception | None) -> None:
+        """End the connection, told to the client soon."""
+        if self._port.client is self:
+            self._port.client = None
+            loop = asyncio.get_running_loop()
+            loop.call_soon(self.protocol.connection_lost, error)
+            self._closed.set_result(None)
+
+
+class DirectPort:
+    """A port within this process: a client on the same loop opens it by its name."""
+
+    ports: ClassVar[dict[str, DirectPort]] = {}
+    """All ports, by their names."""
+
+    _numbers = itertools.count()
+
+    def __init__(self, on_bytes: Callable[[bytes], None]) -> None:
+        """Choose a name that no other has."""
+        self.on_bytes = on_bytes
+        self.client: DirectTransport | None = None
+        self.overruns = 0
+        self.opened = 0
+        self._url = f"/dev/ttyVirtual{next(self._numbers)}"
+        self._plugged = False
+        self.ports[self._url] = self
+
+    @property
+    def url(self) -> str:
+        """Return the name, like that of a serial port."""
+        return self._url
+
+    @property
+    def connected(self) -> bool:
+        """Tell whether a client has it open."""
+        return self.client is not None
+
+    @classmethod
+    def find(cls, url: str) -> DirectPort | None:
+        """Return the port of a name, or of a link to it; also while it is unplugged."""
+        return cls.ports.get(os.path.realpath(url))
+
+    def open(self, protocol: asyncio.Protocol) -> DirectTransport:
+        """Open it as a client; raises OSError as a serial port would."""
+        if not self._plugged:
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), self._url)
+        if self.client is not None:
+            raise BlockingIOError(errno.EBUSY, os.strerror(errno.EBUSY), self._url)
+        self.client = DirectTransport(self, protocol)
+        self.opened += 1
+        protocol.connection_made(self.client)  # type: ignore[arg-type]
+        return self.client
+
+    def plug(self) -> None:
+        """Make it appear."""
+        self._plugged = True
+
+    def unplug(self) -> None:
+        """Make it vanish; the client loses it."""
+        self._plugged = False
+        if self.client is not None:
+            self.client.end(OSError(errno.EIO, os.strerror(errno.EIO)))
+
+    def write(self, data: bytes) -> None:
+        """Give bytes to the client."""
+        if self.client is not None:
+            self.client.protocol.data_received(data)
+
+    def after_reply(self) -> None:
+        """Do nothing."""
+
+    def close(self) -> None:
+        """Take everything away."""
+        self.unplug()
+        del self.ports[self._url]
 
 
 class TcpPort:

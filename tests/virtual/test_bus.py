@@ -19,6 +19,8 @@ from .log import CLIENT
 from .raw_client import RawClient
 from .wire import Segment
 
+pytestmark = pytest.mark.real_time
+
 READ_FULL = b":0103002E0005C9\r\n"
 ANSWER = b">01030A2EA1110A03E803E803E847\r\n"
 E1_BYTE = 11 / 38400

@@ -75,7 +75,7 @@ class Scene:
     """The two ends of a bus, as a context."""
 
     def __init__(self, *boxes: AblBox, tcp: bool = False, quick: bool = True) -> None:
-        make = VirtualBus.tcp if tcp else VirtualBus.pty
+        make = VirtualBus.tcp if tcp else VirtualBus.in_loop
         # The wire is faster too.
         self.virtual = make(*boxes, baud=384_000 if quick else 38_400, parity="E")
         self.protocol = QUICK if quick else PROTOCOL

@@ -18,7 +18,7 @@ from custom_components.evse_bus.evse.evbox import PROTOCOL, EvboxCharger, EvboxC
 from custom_components.evse_bus.evse.evbox.frames import EvboxFramer
 from custom_components.evse_bus.evse.line import Line
 from custom_components.evse_bus.evse.model import CurrentLimit, Orders
-from tests.evse.simulated import now
+from tests.simulated_time import now
 from tests.virtual import CLIENT, EvboxChargePoint, Faults, Order
 from tests.virtual.evbox_frames import checked, order
 from tests.virtual.wire import Segment

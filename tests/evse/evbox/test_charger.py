@@ -23,7 +23,7 @@ from custom_components.evse_bus.evse.model import (
     Orders,
 )
 from custom_components.evse_bus.evse.schedule import Kind
-from tests.evse.simulated import now, simulate
+from tests.simulated_time import now, simulate
 from tests.virtual import Car, EvboxChargePoint, Module
 from tests.virtual.evbox_frames import frame
 

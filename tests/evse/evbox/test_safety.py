@@ -17,7 +17,7 @@ import pytest
 from custom_components.evse_bus.evse.errors import EvseError, RefusedOrderError
 from custom_components.evse_bus.evse.evbox import EvboxCharger
 from custom_components.evse_bus.evse.model import CurrentLimit, OrderChange, Orders
-from tests.evse.simulated import simulate
+from tests.simulated_time import simulate
 from tests.virtual import Car, EvboxChargePoint, Module, Order
 from tests.virtual.evbox_frames import frame
 

@@ -10,7 +10,7 @@ from custom_components.evse_bus.evse.errors import LineBusyError, RefusedOrderEr
 from custom_components.evse_bus.evse.evbox import PROTOCOL, EvboxConfig
 from custom_components.evse_bus.evse.model import CurrentLimit, Orders
 from custom_components.evse_bus.evse.scan import ScanResult
-from tests.evse.simulated import now, simulate
+from tests.simulated_time import now, simulate
 from tests.virtual import EvboxChargePoint, Module
 from tests.virtual.evbox_frames import frame
 

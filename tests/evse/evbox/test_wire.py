@@ -24,6 +24,8 @@ from tests.virtual import (
 )
 from tests.virtual.evbox_frames import frame
 
+pytestmark = pytest.mark.real_time
+
 ORDERS = Orders(limit=CurrentLimit(current=16.0))
 
 

@@ -4,13 +4,13 @@ import asyncio
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 import socket
-import time
 
 from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.ews.charger import EwsPort
 from custom_components.evse_bus.evse.ews.config import EwsPortConfig
 from custom_components.evse_bus.evse.ews.network.listener import Listener
 from custom_components.evse_bus.evse.model import CurrentLimit, Orders
+from tests.simulated_time import now, simulate
 from tests.virtual.ews_box import EwsBox as VirtualBox
 from tests.virtual.ews_dialler import EwsDialler
 
@@ -20,13 +20,13 @@ HOST = "127.0.0.1"
 
 
 def run(scene: Callable[[], object]) -> None:
-    asyncio.run(scene())  # type: ignore[arg-type]
+    simulate(scene())  # type: ignore[arg-type]
 
 
 async def until(what: Callable[[], object], patience: float = 8.0) -> None:
-    end = time.monotonic() + patience
+    end = now() + patience
     while not what():
-        assert time.monotonic() < end, "it never happened"
+        assert now() < end, "it never happened"
         await asyncio.sleep(0.01)
 
 
@@ -69,7 +69,12 @@ async def expected(
 @contextmanager
 def dialling(made: Listener, box: VirtualBox | None = None) -> Iterator[EwsDialler]:
     with EwsDialler(
-        box or VirtualBox(serial=SERIAL), HOST, made.port, retry=RETRY, source_ports=0
+        box or VirtualBox(serial=SERIAL),
+        HOST,
+        made.port,
+        retry=RETRY,
+        source_ports=0,
+        own_thread=False,
     ) as dialler:
         yield dialler
 

@@ -19,7 +19,7 @@ from custom_components.evse_bus.evse.framing import Timing
 from custom_components.evse_bus.evse.line import Line
 from custom_components.evse_bus.evse.model import CurrentLimit, OrderChange, Orders
 from custom_components.evse_bus.evse.readings import ChargerReading, ConnectorReading
-from tests.evse.simulated import now, simulate
+from tests.simulated_time import now, simulate
 from tests.virtual import Car
 from tests.virtual.ews_box import EwsBox as VirtualBox
 from tests.virtual.faults import Faults

@@ -206,7 +206,9 @@ def test_what_has_happened_meanwhile_is_told() -> None:
         async with server() as made, expected(made) as bus:
             events: list[object] = []
             first(bus).subscribe_events(events.append)
-            dialler = EwsDialler(box, HOST, made.port, retry=60, source_ports=0)
+            dialler = EwsDialler(
+                box, HOST, made.port, retry=60, source_ports=0, own_thread=False
+            )
             with dialler:
                 await until(lambda: has_reading(bus))
                 dialler.hang_up(redial=False)
@@ -243,7 +245,10 @@ def test_fifty_boxes() -> None:
                         )
                     )
                     group.create_task(bus.start())
-            with EwsFleet(boxes, HOST, made.port, retry=0.1, source_ports=0):
+            fleet = EwsFleet(
+                boxes, HOST, made.port, retry=0.1, source_ports=0, own_thread=False
+            )
+            with fleet:
                 await until(lambda: all(map(has_reading, buses)), 30)
                 # All have dialled in the same moment, and nobody had to do so twice.
                 assert made.statistics.accepted == len(boxes)

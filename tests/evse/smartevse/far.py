@@ -5,8 +5,8 @@ from random import Random
 from typing import override
 
 from custom_components.evse_bus.evse.errors import LineLostError
-from tests.evse.simulated import now
 from tests.evse.smartevse.ether import BYTE, Ether
+from tests.simulated_time import now
 
 MERGES = 0.003
 """A pause that does not end a frame, s."""

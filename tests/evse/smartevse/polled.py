@@ -16,7 +16,7 @@ from custom_components.evse_bus.evse.smartevse.charger import (
 )
 from custom_components.evse_bus.evse.smartevse.dialects import MAPS, Dialect
 from custom_components.evse_bus.evse.smartevse.timing import QUIET
-from tests.evse.simulated import now, simulate
+from tests.simulated_time import now, simulate
 from tests.virtual import Car, SmartEvseController
 from tests.virtual.smartevse_registers import DIALECTS
 

@@ -8,7 +8,7 @@ from custom_components.evse_bus.evse.model import Fault, OrderChange
 from custom_components.evse_bus.evse.smartevse.dialects import MAPS
 from custom_components.evse_bus.evse.smartevse.registers import read_request
 from custom_components.evse_bus.evse.smartevse.timing import QUIET
-from tests.evse.simulated import now
+from tests.simulated_time import now
 
 from .polled import LATER, PolledScene, play
 

@@ -16,8 +16,8 @@ from custom_components.evse_bus.evse.smartevse.master import (
 )
 from custom_components.evse_bus.evse.smartevse.sharing import STOPS_ALONE
 from custom_components.evse_bus.evse.smartevse.timing import TIMING
-from tests.evse.simulated import now, simulate
 from tests.evse.smartevse.ether import Box, MasterScene, Sent
+from tests.simulated_time import now, simulate
 
 GARBAGE = bytes(range(1, 40))
 

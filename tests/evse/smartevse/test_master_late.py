@@ -14,11 +14,11 @@ from custom_components.evse_bus.evse.model import (
     Persistence,
 )
 from custom_components.evse_bus.evse.smartevse.master import ECHO, PERIOD
-from tests.evse.simulated import SimulatedLoop, now, simulate
 from tests.evse.smartevse.ether import MasterScene
 from tests.evse.smartevse.far import FarEther
 from tests.evse.smartevse.test_master_others import FOREIGN
 from tests.evse.smartevse.test_master_requests import ASKS, answers, frame
+from tests.simulated_time import SimulatedLoop, now, simulate
 
 
 def test_late_echoes_of_several_broadcasts_are_no_other_master() -> None:

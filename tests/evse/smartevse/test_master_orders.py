@@ -13,8 +13,8 @@ from custom_components.evse_bus.evse.model import (
     Supply,
 )
 from custom_components.evse_bus.evse.smartevse.member import GIVE_BACK
-from tests.evse.simulated import now, simulate
 from tests.evse.smartevse.ether import MasterScene
+from tests.simulated_time import now, simulate
 
 OFF = "021000a7000102000"
 STOP, START = "021000a70001020000abb7", "021000a700010200016a77"

@@ -10,8 +10,8 @@ from custom_components.evse_bus.evse.model import Fault, OrderChange, Supply
 from custom_components.evse_bus.evse.scan import ScanResult
 from custom_components.evse_bus.evse.smartevse import MASTER
 from custom_components.evse_bus.evse.smartevse.master import OTHERS, Master
-from tests.evse.simulated import now, simulate
 from tests.evse.smartevse.ether import MasterScene
+from tests.simulated_time import now, simulate
 
 FOREIGN = bytes.fromhex("001000010004080064003c00000000ff7a")
 READ = bytes.fromhex("040400a00009307b")

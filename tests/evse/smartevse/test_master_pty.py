@@ -18,6 +18,8 @@ from custom_components.evse_bus.evse.smartevse import MASTER, SlaveConfig, maste
 from tests.virtual import Car, SmartEvse, VirtualBus, smartevse_requests_in
 from tests.virtual.device import Device
 
+pytestmark = pytest.mark.real_time
+
 PATIENCE = 20.0
 
 

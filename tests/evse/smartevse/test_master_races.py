@@ -11,9 +11,9 @@ from custom_components.evse_bus.evse.model import (
     OrderChange,
     Supply,
 )
-from tests.evse.simulated import now, simulate
 from tests.evse.smartevse.ether import MasterScene
 from tests.evse.smartevse.test_master_requests import ASKS, answers
+from tests.simulated_time import now, simulate
 
 ACCESS = b"\x10\x00\xa7"
 START = "021000a70001020001"

@@ -6,8 +6,8 @@ import pytest
 
 from custom_components.evse_bus.evse.model import OrderChange
 from custom_components.evse_bus.evse.smartevse.master import PERIOD
-from tests.evse.simulated import now, simulate
 from tests.evse.smartevse.ether import MasterScene, Sent
+from tests.simulated_time import now, simulate
 
 
 def crc(head: str) -> bytes:

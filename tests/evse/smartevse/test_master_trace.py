@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, override
 
 from custom_components.evse_bus.evse.model import OrderChange
-from tests.evse.simulated import now, simulate
 from tests.evse.smartevse.ether import Box, Ether, MasterScene
+from tests.simulated_time import now, simulate
 from tests.virtual.smartevse_frames import values_frame
 
 TRACE: dict[str, list[dict[str, Any]]] = json.loads(

@@ -20,7 +20,7 @@ from custom_components.evse_bus.evse.model import (
 )
 from custom_components.evse_bus.evse.smartevse import POLLED
 from custom_components.evse_bus.evse.smartevse.dialects import Dialect
-from tests.evse.simulated import now, simulate
+from tests.simulated_time import now, simulate
 
 from .polled import ALL, LATER, OLDER, V2_17, V2_20, PolledScene, play
 

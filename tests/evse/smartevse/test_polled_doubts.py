@@ -13,7 +13,7 @@ from custom_components.evse_bus.evse.model import Fault, OrderChange, Setting
 from custom_components.evse_bus.evse.smartevse import POLLED
 from custom_components.evse_bus.evse.smartevse.dialects import MAPS, Dialect
 from custom_components.evse_bus.evse.smartevse.registers import read_request
-from tests.evse.simulated import now, simulate
+from tests.simulated_time import now, simulate
 
 from .polled import ALL, LATER, OLDER, V2_17, V2_20, PolledScene, play
 

@@ -13,6 +13,8 @@ from tests.virtual import Car, SmartEvse, VirtualBus
 
 from .polled import V2_17
 
+pytestmark = pytest.mark.real_time
+
 SCALE = 10.0
 
 

@@ -27,7 +27,7 @@ from custom_components.evse_bus.evse.smartevse import POLLED
 from custom_components.evse_bus.evse.smartevse.charger import PolledConfig
 from custom_components.evse_bus.evse.smartevse.dialects import Dialect
 from custom_components.evse_bus.evse.smartevse.registers import write_current
-from tests.evse.simulated import now, simulate
+from tests.simulated_time import now, simulate
 
 from .test_trace import TRACE
 

@@ -17,7 +17,7 @@ from custom_components.evse_bus.evse.model import (
     Setting,
 )
 from custom_components.evse_bus.evse.smartevse.dialects import MAPS, Dialect
-from tests.evse.simulated import now
+from tests.simulated_time import now
 
 from .polled import ALL, LATER, OLDER, V2_17, V2_20, PolledScene, play
 

@@ -15,7 +15,7 @@ import pytest
 from custom_components.evse_bus.evse.errors import EvseError
 from custom_components.evse_bus.evse.model import MINIMUM_CURRENT, OrderChange
 from custom_components.evse_bus.evse.smartevse.dialects import MAPS, Dialect
-from tests.evse.simulated import now, simulate
+from tests.simulated_time import now, simulate
 
 from .polled import ALL, LATER, PolledScene, as_write
 
