@@ -4,10 +4,10 @@ import asyncio
 
 import pytest
 
-from custom_components.evse_bus.evse.abl import PROTOCOL
+from custom_components.evse_bus.evse.abl import PROTOCOL, reader
 from custom_components.evse_bus.evse.errors import WrongChargerError
 from custom_components.evse_bus.evse.model import Capability, Fault, OrderChange, Status
-from tests.virtual import AblBox, Car
+from tests.virtual import AblBox, Car, Request
 
 from .scene import LIMIT, Scene, config, orders, until
 
@@ -120,6 +120,29 @@ async def test_a_missing_optional_register_is_no_missed_reply() -> None:
         assert two.reading.details["icmax_duty"] == 16.6
         # Probed once, not with every poll.
         assert len(scene.reads(1, 0x0F)) == 1
+
+
+async def test_flags_that_stay_away_are_dropped_after_a_while(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(reader, "FLAGS_INTERVAL", 0.0)
+    box = AblBox(1)
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders())
+        assert charger.reading is not None
+        assert charger.reading.details["overcurrent"] == 0
+        answer = box._answer
+
+        def without_flags(request: Request) -> bytes | None:
+            return None if request.register == 0x06 else answer(request)
+
+        box._answer = without_flags  # type: ignore[method-assign]
+        await until(
+            lambda: charger.reading and "overcurrent" not in charger.reading.details
+        )
+        assert len(scene.reads(1, 0x06)) >= reader.FLAGS_MISSES
+        assert charger.misses == 0
+        assert charger.available
 
 
 async def test_a_reply_to_another_request_changes_nothing() -> None:

@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 from custom_components.evse_bus.evse.abl.charger import AblCharger
-from custom_components.evse_bus.evse.errors import EvseError
+from custom_components.evse_bus.evse.errors import EvseError, NotConfirmedError
 from custom_components.evse_bus.evse.model import Command, OrderChange
 from tests.virtual import AblBox, Car, Request
 
@@ -30,9 +30,7 @@ async def cut_off_wake(scene: Scene, box: AblBox) -> AblCharger:
     return charger
 
 
-async def test_a_pause_ordered_meanwhile_is_written_before_the_outlet_is_enabled() -> (
-    None
-):
+async def test_a_pause_ordered_meanwhile_is_written_before_enabling() -> None:
     box = box_with(sleepy())
     async with Scene(box) as scene:
         charger = await cut_off_wake(scene, box)
@@ -70,6 +68,21 @@ async def test_an_outlet_disabled_by_the_user_meanwhile_stays_so() -> None:
         await scene.polled(charger, 5)
         assert box.state == "E0"
         assert scene.writes() == [E0]
+
+
+async def test_an_outlet_that_cannot_be_enabled_again_is_enabled_later() -> None:
+    box = box_with(sleepy())
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders())
+        await until(lambda: box.state == "B2")
+        await scene.polled(charger)
+        box.outlet.e0_a1_enabled = False
+        with pytest.raises(NotConfirmedError, match="does not leave its state"):
+            await charger.command(Command.WAKE)
+        assert box.state == "E0"
+        box.outlet.e0_a1_enabled = True
+        await until(lambda: box.state != "E0")
+        await until(lambda: charger.pending_cleanup is None)
 
 
 async def reset_when_disabled(

@@ -118,6 +118,17 @@ async def test_an_outlet_that_does_not_follow() -> None:
         assert Fault.INTERNAL in charger.faults
 
 
+async def test_an_outlet_that_confirms_and_does_not_follow() -> None:
+    box = box_with()
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders())
+        box._modify_state = lambda _value: True  # type: ignore[method-assign]
+        with pytest.raises(NotConfirmedError, match="does not change to E0"):
+            await charger.command(Command.SET_OUTLET, value=False)
+        # The box has confirmed it: no repeat.
+        assert scene.writes() == [E0]
+
+
 @pytest.mark.parametrize("value", [None, 1, "on"])
 async def test_an_outlet_accepts_only_on_and_off(value: object) -> None:
     async with Scene(box_with()) as scene:
@@ -211,6 +222,27 @@ async def test_a_car_is_woken_though_replies_are_lost() -> None:
         await charger.command(Command.WAKE)
         assert scene.writes() == [E0, A1]
         assert box.state != "E0"
+
+
+@pytest.mark.parametrize("refusal", [None, b">0190046B\r\n"])
+async def test_a_car_is_not_woken_by_a_box_that_stays_in_b2(
+    refusal: bytes | None,
+) -> None:
+    box = box_with(sleepy())
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders())
+        await until(lambda: box.state == "B2")
+        await scene.polled(charger)
+        answer = box._answer
+
+        def ignore(request: Request) -> bytes | None:
+            return refusal if request.register == STATE else answer(request)
+
+        box._answer = ignore  # type: ignore[method-assign]
+        with pytest.raises(EvseError, match="exception 4" if refusal else "E0"):
+            await charger.command(Command.WAKE)
+        assert scene.writes() == [E0]
+        assert charger.pending_cleanup is None
 
 
 async def test_one_command_at_a_time() -> None:

@@ -69,6 +69,19 @@ async def test_a_device_id_in_use() -> None:
         assert charger.config.address == 1
 
 
+async def test_a_device_id_that_is_not_taken() -> None:
+    box = box_with()
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders())
+        # The box confirms the write and ignores it.
+        box._configure = lambda _value: True  # type: ignore[method-assign]
+        with pytest.raises(NotConfirmedError, match="not found at device-ID 2"):
+            await charger.command(Command.SET_ADDRESS, 2)
+        assert charger.config.address == 1
+        await until(lambda: charger.available and charger.pending_cleanup is None)
+        assert box.state == "A1"
+
+
 @pytest.mark.parametrize("value", [0, 17, True, None, 2.0])
 async def test_an_invalid_device_id_is_refused(value: object) -> None:
     async with Scene(box_with()) as scene:
