@@ -36,7 +36,7 @@ SUPPLY = {"supply_limit": 20.0, "supply_minimum": 6.0}
 @pytest.fixture(autouse=True)
 def quick_master(monkeypatch: pytest.MonkeyPatch) -> None:
     """Listen for less long before we speak; the others' time runs faster."""
-    shorten(monkeypatch, LISTENING=0.6, OTHERS=1.0)
+    shorten(monkeypatch, LISTENING=0.6, STAY_SILENT=1.0)
 
 
 def slaves(count: int = 2, **options: Any) -> list[SmartEvse]:  # noqa: ANN401 - a box's
@@ -227,7 +227,7 @@ async def test_without_supply_they_wait_and_are_still_allowed(
     hass: HomeAssistant, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No sun: access is off in the boxes, and nobody has to switch them on again."""
-    shorten(monkeypatch, GIVE_BACK=1.0)
+    shorten(monkeypatch, WITHHELD_FOR=1.0)
     boxes = slaves()
     async with running(hass, *boxes, supply=SUPPLY) as (entry, bus):
         await both_charge(hass, entry, boxes)

@@ -19,8 +19,8 @@ from custom_components.evse_bus.evse.modbus import RtuFramer
 from custom_components.evse_bus.evse.model import CurrentLimit, Orders, Supply
 from custom_components.evse_bus.evse.smartevse.config import SlaveConfig
 from custom_components.evse_bus.evse.smartevse.master import Master
+from custom_components.evse_bus.evse.smartevse.reader import TIMING
 from custom_components.evse_bus.evse.smartevse.slave import SlaveSmartEvse
-from custom_components.evse_bus.evse.smartevse.timing import TIMING
 from tests.simulated_time import now
 from tests.virtual import Car, SmartEvseController
 from tests.virtual.smartevse_registers import DIALECTS

@@ -10,12 +10,9 @@ from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.model import CurrentLimit, Orders
 from custom_components.evse_bus.evse.readings import ChargerReading, ConnectorReading
 from custom_components.evse_bus.evse.smartevse import POLLED
-from custom_components.evse_bus.evse.smartevse.charger import (
-    PolledConfig,
-    PolledSmartEvse,
-)
+from custom_components.evse_bus.evse.smartevse.config import PolledConfig
 from custom_components.evse_bus.evse.smartevse.dialects import MAPS, Dialect
-from custom_components.evse_bus.evse.smartevse.timing import QUIET
+from custom_components.evse_bus.evse.smartevse.polled import QUIET, PolledSmartEvse
 from tests.simulated_time import now, simulate
 from tests.virtual import Car, SmartEvseController
 from tests.virtual.smartevse_registers import DIALECTS

@@ -6,8 +6,8 @@ from itertools import pairwise
 from custom_components.evse_bus.evse.exchange import Turn
 from custom_components.evse_bus.evse.model import Fault, OrderChange
 from custom_components.evse_bus.evse.smartevse.dialects import MAPS
+from custom_components.evse_bus.evse.smartevse.polled import QUIET
 from custom_components.evse_bus.evse.smartevse.registers import read_request
-from custom_components.evse_bus.evse.smartevse.timing import QUIET
 from tests.simulated_time import now
 
 from .polled import LATER, PolledScene, play

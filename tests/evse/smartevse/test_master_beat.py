@@ -10,12 +10,12 @@ from custom_components.evse_bus.evse.errors import EvseError, LineLostError
 from custom_components.evse_bus.evse.model import OrderChange, Setting, Supply
 from custom_components.evse_bus.evse.smartevse.master import (
     LISTENING,
-    LOOKING,
     PERIOD,
+    READING,
     SLACK,
 )
+from custom_components.evse_bus.evse.smartevse.reader import TIMING
 from custom_components.evse_bus.evse.smartevse.sharing import STOPS_ALONE
-from custom_components.evse_bus.evse.smartevse.timing import TIMING
 from tests.evse.smartevse.ether import Box, MasterScene, Sent
 from tests.simulated_time import now, simulate
 
@@ -29,7 +29,7 @@ def test_it_listens_then_looks_then_speaks() -> None:
         async with scene:
             await asyncio.sleep(LISTENING - 0.01)
             assert scene.line.sent == []
-            await asyncio.sleep(LOOKING)
+            await asyncio.sleep(READING)
             first = scene.broadcasts()[0]
             before = [s for s in scene.line.sent if s.when < first.when]
             # Status and settings of both, and nothing written.
@@ -199,7 +199,7 @@ def test_a_port_that_is_lost_for_longer() -> None:
             back = scene.line.last_activity
             await scene.until(lambda: scene.box(2).state == "C")
             first = next(one for one in scene.broadcasts() if one.when > back)
-            assert first.when - back < LOOKING
+            assert first.when - back < READING
             await asyncio.sleep(5)
             assert scene.offers == 16
 

@@ -12,7 +12,7 @@ from custom_components.evse_bus.evse.model import (
     Status,
     Supply,
 )
-from custom_components.evse_bus.evse.smartevse.member import GIVE_BACK
+from custom_components.evse_bus.evse.smartevse.slave import WITHHELD_FOR
 from tests.evse.smartevse.ether import MasterScene
 from tests.simulated_time import now, simulate
 
@@ -248,8 +248,8 @@ def test_the_last_come_is_stopped_where_the_supply_does_not_suffice() -> None:
             # Room at once, but it does not flap.
             await scene.master.change_supply(Supply(limit=18.0))
             back = await scene.until(lambda: scene.box(4).state == "C", 100)
-            assert now() - lowered >= GIVE_BACK
-            assert back < GIVE_BACK + 10
+            assert now() - lowered >= WITHHELD_FOR
+            assert back < WITHHELD_FOR + 10
             assert scene.offers == 18
             # The user's word is not ours to give back.
             await scene.master.change_supply(Supply(limit=13.0))

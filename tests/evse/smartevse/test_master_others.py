@@ -9,7 +9,7 @@ from custom_components.evse_bus.evse.errors import NotAvailableError, RefusedOrd
 from custom_components.evse_bus.evse.model import Fault, OrderChange, Supply
 from custom_components.evse_bus.evse.scan import ScanResult
 from custom_components.evse_bus.evse.smartevse import MASTER
-from custom_components.evse_bus.evse.smartevse.master import OTHERS, Master
+from custom_components.evse_bus.evse.smartevse.master import STAY_SILENT, Master
 from tests.evse.smartevse.ether import MasterScene
 from tests.simulated_time import now, simulate
 
@@ -29,7 +29,7 @@ def test_another_master_is_heard_before_our_first_word() -> None:
             scene.master.subscribe(lambda: told.append(scene.master.noticed))
             await asyncio.sleep(2.3)
             scene.line.say(FOREIGN)
-            await asyncio.sleep(OTHERS - 1)
+            await asyncio.sleep(STAY_SILENT - 1)
             assert scene.line.sent == []
             assert told == [frozenset({Fault.SECOND_MASTER})]
             await asyncio.sleep(5)
@@ -74,7 +74,7 @@ def test_another_master_silences_us_at_once_and_for_good(frame: str) -> None:
             assert not scene.slave(2).available
             # Requests of the slaves are its business, too.
             scene.line.say(bytes.fromhex("020600030082f998"))
-            await asyncio.sleep(OTHERS - 5)
+            await asyncio.sleep(STAY_SILENT - 5)
             assert [s for s in scene.line.sent if s.when > heard + 0.02] == []
             await asyncio.sleep(10)
             assert scene.master.noticed == frozenset()

@@ -7,7 +7,7 @@ import pytest
 
 from custom_components.evse_bus.evse.model import CurrentLimit, OrderChange, Orders
 from custom_components.evse_bus.evse.smartevse import POLLED
-from custom_components.evse_bus.evse.smartevse.charger import PolledConfig
+from custom_components.evse_bus.evse.smartevse.config import PolledConfig
 from custom_components.evse_bus.evse.smartevse.dialects import Dialect
 from tests.virtual import Car, SmartEvse, VirtualBus
 

@@ -1,5 +1,6 @@
 """Registers of a SmartEVSE: bytes of the recorded firmware, and anything at all."""
 
+import asyncio
 from dataclasses import replace
 
 from hypothesis import given, strategies as st
@@ -34,7 +35,7 @@ from custom_components.evse_bus.evse.smartevse.dialects import (
     Dialect,
     Status,
 )
-from custom_components.evse_bus.evse.smartevse.probing import Probe
+from custom_components.evse_bus.evse.smartevse.probing import find_dialect
 from custom_components.evse_bus.evse.smartevse.registers import (
     decode_configuration,
     decode_status,
@@ -48,10 +49,10 @@ from custom_components.evse_bus.evse.smartevse.registers import (
 )
 from custom_components.evse_bus.evse.smartevse.states import (
     is_stopped,
+    ocpp_status,
     offered,
+    shows_plug,
     state_of,
-    tells_plug,
-    word_of,
 )
 
 from .polled import ALL, LATER, V2_17, V2_20
@@ -114,8 +115,8 @@ def test_no_communication_as_recorded() -> None:
     assert data is not None
     status = decode_status(V2_17, data)
     assert status.faults == {Fault.NO_COMM}
-    assert word_of(V2_17, status) is Word.FAULTED
-    assert not tells_plug(V2_17, status)
+    assert ocpp_status(V2_17, status) is Word.FAULTED
+    assert not shows_plug(V2_17, status)
 
 
 def test_configuration_as_recorded() -> None:
@@ -181,7 +182,7 @@ def test_any_bytes_are_a_status_or_held_back(dialect: Dialect, data: bytes) -> N
     except ImplausibleReplyError:
         return
     state_of(dialect, status.raw_state)
-    word_of(dialect, status)
+    ocpp_status(dialect, status)
     current = offered(dialect, status)
     assert current is None or current == 0 or 6 <= current <= 80
     if is_stopped(dialect, status):
@@ -269,51 +270,65 @@ A0_17 = words(0x41, 0, 0, 6, 0, 0, 0, 1, 0)
 A0_20 = words(0, 0, 0, 6, 0, 0, 0, 1, 0)
 
 
+LATER_STATUS = MAPS[LATER].status.block
+ILLEGAL_ADDRESS = ExchangeRefusedError("exception 2", 2)
+
+type Reply = bytes | ExchangeRefusedError
+
+
+class Replies:
+    """A box with these replies, one after the other, and the blocks read from it."""
+
+    def __init__(self, *replies: Reply) -> None:
+        self.replies = iter(replies)
+        self.blocks: list[Block] = []
+
+    async def read(self, block: Block) -> bytes:
+        self.blocks.append(block)
+        reply = next(self.replies)
+        if isinstance(reply, ExchangeRefusedError):
+            raise reply
+        return reply
+
+
+def dialect_of(box: Replies) -> Dialect:
+    return asyncio.run(find_dialect(box.read))
+
+
 def test_a_letter_is_2_17() -> None:
-    probe = Probe()
-    probe.told(A0_17)
-    assert probe.found is V2_17
+    box = Replies(A0_17)
+    assert dialect_of(box) is V2_17
+    assert box.blocks == [PROBE_A0]
 
 
 def test_a_number_alone_is_not_2_20() -> None:
-    probe = Probe()
-    probe.told(A0_20)
-    assert probe.found is None
-    assert probe.ask == PROBE_A9
-    probe.told(words(0, 0, 0))
-    assert probe.found is V2_20
+    box = Replies(A0_20, words(0, 0, 0))
+    assert dialect_of(box) is V2_20
+    assert box.blocks == [PROBE_A0, PROBE_A9]
 
 
 def test_without_a0_it_may_be_a_later_one() -> None:
-    probe = Probe()
-    probe.refused(2)
-    assert probe.found is None
-    assert probe.ask == MAPS[LATER].status.block
-    probe.told(later())
-    assert probe.found is LATER
+    box = Replies(ILLEGAL_ADDRESS, later())
+    assert dialect_of(box) is LATER
+    assert box.blocks == [PROBE_A0, LATER_STATUS]
 
 
 @pytest.mark.parametrize("code", [1, 3, 4, None])
 def test_another_refusal_is_no_smartevse(code: int | None) -> None:
     with pytest.raises(ImplausibleReplyError):
-        Probe().refused(code)
+        dialect_of(Replies(ExchangeRefusedError("exception", code)))
 
 
 def test_a_number_without_a9_is_no_known_dialect() -> None:
-    probe = Probe()
-    probe.told(A0_20)
     with pytest.raises(ImplausibleReplyError):
-        probe.refused(2)
-    assert probe.found is None
+        dialect_of(Replies(A0_20, ILLEGAL_ADDRESS))
 
 
 def test_a_meter_is_no_smartevse() -> None:
     """Twelve words of floating point numbers at unit 1."""
-    probe = Probe()
-    probe.refused(2)
+    floats = words(0x4366, 0x1999, 0x4365, 0x8000, *([0x4100] * 8))
     with pytest.raises(ImplausibleReplyError):
-        probe.told(words(0x4366, 0x1999, 0x4365, 0x8000, *([0x4100] * 8)))
-    assert probe.found is None
+        dialect_of(Replies(ILLEGAL_ADDRESS, floats))
 
 
 @given(
@@ -324,30 +339,27 @@ def test_a_meter_is_no_smartevse() -> None:
             st.binary(max_size=30),
             st.sampled_from((A0_17, A0_20, words(0, 0, 0), later())),
         ),
-        max_size=6,
+        min_size=2,
+        max_size=2,
     )
 )
-def test_a_dialect_is_found_only_by_its_own_words(
-    answers: list[int | bytes | None],
+def test_a_dialect_is_found_only_by_its_own_registers(
+    replies: list[int | bytes | None],
 ) -> None:
-    probe = Probe()
-    asked = [probe.ask]
-    for answer in answers:
-        if probe.found is not None:
-            break
-        try:
-            if isinstance(answer, bytes):
-                probe.told(answer)
-            else:
-                probe.refused(answer)
-        except ImplausibleReplyError:
-            assert probe.found is None
-            break
-        asked.append(probe.ask)
-    if probe.found is V2_20:
-        assert PROBE_A9 in asked
-    if probe.found is LATER:
-        assert MAPS[LATER].status.block in asked
+    box = Replies(
+        *(
+            reply
+            if isinstance(reply, bytes)
+            else ExchangeRefusedError("exception", reply)
+            for reply in replies
+        )
+    )
+    try:
+        dialect = dialect_of(box)
+    except ImplausibleReplyError:
+        return
+    assert (PROBE_A9 in box.blocks) == (dialect is V2_20)
+    assert (LATER_STATUS in box.blocks) == (dialect is LATER)
 
 
 # -- States --------------------------------------------------------------------------
@@ -355,11 +367,11 @@ def test_a_dialect_is_found_only_by_its_own_words(
 
 def test_a_without_access_is_not_unplugged() -> None:
     status = decode_status(V2_17, words(0x41, 0, 16, 6, 0, 0, 130, 0, 0))
-    assert not tells_plug(V2_17, status)
-    assert word_of(V2_17, status) is Word.UNAVAILABLE
+    assert not shows_plug(V2_17, status)
+    assert ocpp_status(V2_17, status) is Word.UNAVAILABLE
     assert is_stopped(V2_17, status)
     assert offered(V2_17, status) == 0
-    assert tells_plug(V2_17, replace(status, access=True))
+    assert shows_plug(V2_17, replace(status, access=True))
 
 
 def test_later_states() -> None:
@@ -368,8 +380,8 @@ def test_later_states() -> None:
     assert state_of(LATER, "C1").charging is None
     waiting = replace(stopping, raw_state="B1", access=False)
     assert is_stopped(LATER, waiting)
-    assert word_of(LATER, waiting) is Word.SUSPENDED_EVSE
-    assert tells_plug(LATER, waiting)
+    assert ocpp_status(LATER, waiting) is Word.SUSPENDED_EVSE
+    assert shows_plug(LATER, waiting)
     assert stopping.serial == "4711"
     assert stopping.temperature == 20
 

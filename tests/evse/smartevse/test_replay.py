@@ -24,7 +24,7 @@ from custom_components.evse_bus.evse.model import (
 )
 from custom_components.evse_bus.evse.safety import clamp
 from custom_components.evse_bus.evse.smartevse import POLLED
-from custom_components.evse_bus.evse.smartevse.charger import PolledConfig
+from custom_components.evse_bus.evse.smartevse.config import PolledConfig
 from custom_components.evse_bus.evse.smartevse.dialects import Dialect
 from custom_components.evse_bus.evse.smartevse.registers import write_current
 from tests.simulated_time import now, simulate

@@ -11,17 +11,17 @@ from custom_components.evse_bus.evse.smartevse.sharing import (
     STOPS_ALONE,
     Claim,
     Draw,
+    above_share,
+    fit_to_limit,
     grant,
-    in_the_way,
     next_values,
     offered,
     split,
-    together,
 )
 
 
 def claims(*wishes: int) -> list[Claim]:
-    return [Claim(unit=2 + n, wish=wish, came=n) for n, wish in enumerate(wishes)]
+    return [Claim(unit=2 + n, demand=wish, since=n) for n, wish in enumerate(wishes)]
 
 
 @pytest.mark.parametrize(
@@ -67,14 +67,14 @@ def test_split(
         (80, (80, 0), (2, 3), (60, 0)),
     ],
 )
-def test_together(
+def test_fit_to_limit(
     limit: int,
     values: tuple[int, ...],
     active: tuple[int, ...],
     said: tuple[int, ...],
 ) -> None:
     by_unit = dict(enumerate(values, 2))
-    assert tuple(together(limit, by_unit, active).values()) == said
+    assert tuple(fit_to_limit(limit, by_unit, active).values()) == said
 
 
 @given(
@@ -88,7 +88,7 @@ def test_what_is_said_together_is_never_above_the_limit(
 ) -> None:
     shares = split(limit, minimum, claims(*wishes))
     values = shares | dict(enumerate(idle, 10))
-    said = together(limit, values, shares)
+    said = fit_to_limit(limit, values, shares)
     assert sum(said.values()) <= limit
     assert all(said[unit] <= value for unit, value in values.items())
     assert all(value == 0 or value >= LOWEST for value in said.values())
@@ -98,9 +98,9 @@ def test_what_is_said_together_is_never_above_the_limit(
 
 
 def test_what_nobody_can_stop_has_its_6_a_before_all() -> None:
-    gone = Claim(unit=2, wish=60, came=9, fixed=True)
-    stopping = Claim(unit=3, wish=0, came=9, fixed=True)
-    last = Claim(unit=4, wish=160)
+    gone = Claim(unit=2, demand=60, since=9, fixed=True)
+    stopping = Claim(unit=3, demand=0, since=9, fixed=True)
+    last = Claim(unit=4, demand=160)
     assert split(160, 60, [gone, last]) == {2: 60, 4: 100}
     assert split(190, 60, [gone, stopping, last]) == {2: 60, 3: 0, 4: 70}
     assert split(160, 60, [gone, stopping, last]) == {2: 60, 3: 0, 4: 0}
@@ -118,10 +118,10 @@ def test_a_split_keeps_to_the_limit_and_to_the_wishes(
     assert sum(shares.values()) <= limit
     for claim in claims(*wishes):
         share = shares[claim.unit]
-        assert share <= claim.wish
-        assert share == 0 or share >= min(minimum, claim.wish) >= LOWEST
+        assert share <= claim.demand
+        assert share == 0 or share >= min(minimum, claim.demand) >= LOWEST
     rest = limit - sum(shares.values())
-    unsatisfied = [c for c in claims(*wishes) if LOWEST <= shares[c.unit] < c.wish]
+    unsatisfied = [c for c in claims(*wishes) if LOWEST <= shares[c.unit] < c.demand]
     # Less is left than there are boxes that could use it.
     assert not unsatisfied or rest < len(unsatisfied)
 
@@ -133,11 +133,11 @@ def test_nonsense_counts_as_what_a_box_makes_of_it() -> None:
 def test_a_draw_counts_everything_a_box_may_be_following() -> None:
     draw = Draw()
     draw.read(100, 0.0, closed=True)
-    draw.said(80, 1.0)
+    draw.sent(80, 1.0)
     assert draw.most(1.0) == 100
     draw.read(80, 1.2, closed=True)
     assert draw.most(1.2) == 80
-    draw.said(130, 2.0)
+    draw.sent(130, 2.0)
     assert draw.most(2.0) == 130
     draw.read(80, 2.2, closed=True)
     assert draw.most(2.2) == 80
@@ -149,7 +149,7 @@ def test_who_is_not_heard_may_still_hear() -> None:
     draw = Draw()
     draw.read(160, 0.0, closed=True)
     for second in range(2, 30, 2):
-        draw.said(60, second)
+        draw.sent(60, second)
         most = 160 if second < STOPS_ALONE else 60
         assert draw.most(second) == most
     # Without a broadcast it has stopped.
@@ -158,10 +158,10 @@ def test_who_is_not_heard_may_still_hear() -> None:
 
 def test_nobody_knows_what_goes_on_before_the_first_word() -> None:
     draw = Draw(unknown_until=12.0)
-    draw.said(60, 5.0)
+    draw.sent(60, 5.0)
     assert draw.most(11.9) == float("inf")
     assert draw.most(12.0) == 60
-    draw.asked(6.0)
+    draw.requested(6.0)
     assert draw.most(6.0) == 0
 
 
@@ -169,12 +169,12 @@ def test_a_grant_counts_until_a_later_broadcast_was_surely_heard() -> None:
     draw = Draw()
     draw.read(160, 0.0, closed=False)
     draw.granted(160, 1.0)
-    draw.said(80, 2.0)
+    draw.sent(80, 2.0)
     assert draw.most(2.0) == 160
     # 0 may be the memory of a box that was switched off and on before the grant.
     draw.read(0, 2.1, closed=True)
     assert draw.most(2.1) == 160
-    draw.said(80, 3.0)
+    draw.sent(80, 3.0)
     draw.read(80, 3.1, closed=True)
     assert draw.most(3.1) == 80
 
@@ -183,7 +183,7 @@ def test_a_repeated_request_does_not_undo_its_grant() -> None:
     draw = Draw()
     draw.read(100, 0.0, closed=False)
     draw.granted(100, 1.0)
-    draw.asked(1.1)
+    draw.requested(1.1)
     assert draw.most(1.1) == 100
 
 
@@ -242,13 +242,13 @@ class World:
             fixed = draw.may_draw and unreachable
             if draw.may_draw or unit == asking:
                 wish = min(wish, LOWEST) if fixed else wish
-                active.append(Claim(unit=unit, wish=wish, came=unit, fixed=fixed))
+                active.append(Claim(unit=unit, demand=wish, since=unit, fixed=fixed))
         return dict.fromkeys(self.draws, 0) | split(self.limit, self.minimum, active)
 
     def broadcast(self, hearing: set[int], asking: int | None = None) -> None:
         values = next_values(self.limit, self.shares(asking), self.draws, self.now)
         for unit, value in values.items():
-            self.draws[unit].said(value, self.now)
+            self.draws[unit].sent(value, self.now)
             if unit in hearing:
                 self.slaves[unit].broadcast(value)
 
@@ -261,7 +261,7 @@ class World:
         slave = self.slaves[unit]
         if slave.closed or unit in self.gone:
             return
-        self.draws[unit].asked(self.now)
+        self.draws[unit].requested(self.now)
         share = self.shares(unit)[unit]
         value = grant(self.limit, share, unit, self.draws, self.now)
         if value:
@@ -343,7 +343,7 @@ def test_first_others_go_down_then_one_goes_up() -> None:
     world.read(3)
     world.ask(3, arrives=True)
     assert slaves[3].offers == 0
-    assert in_the_way(world.shares(3), world.draws, world.now) == [2]
+    assert above_share(world.shares(3), world.draws, world.now) == [2]
     # It misses the first: no room is believed before it is read back.
     world.broadcast({3}, asking=3)
     world.read(2)

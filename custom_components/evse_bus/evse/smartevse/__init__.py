@@ -10,13 +10,12 @@ from ..model import MAXIMUM_CURRENT
 from ..options import Toggle
 from ..protocol import Make, Protocol, SupplyRange
 from ..redaction import SerialNumbers
-from .charger import PolledSmartEvse
 from .config import PolledConfig, SlaveConfig
 from .master import Master
-from .master_scan import scan as master_scan
-from .scan import scan
+from .polled import PolledSmartEvse
+from .reader import TIMING
+from .scan import scan_polled, scan_slaves
 from .slave import SlaveSmartEvse
-from .timing import TIMING
 
 SETTINGS: Final = LineSettings(baudrate=9600)
 
@@ -48,7 +47,7 @@ POLLED: Final = Protocol(
     framer=RtuFramer,
     config=PolledConfig,
     charger=PolledSmartEvse,
-    scan=scan,
+    scan=scan_polled,
     # Its setting LOAD BAL, as an address: 0 is Disabled, 1 is Master.
     address=NumberAddress(key="unit", lowest=0, highest=1, labelled=True, single=True),
     options=(Toggle(name="stop_on_shutdown", prominent=True),),
@@ -66,7 +65,7 @@ MASTER: Final = Protocol(
     framer=RtuFramer,
     config=SlaveConfig,
     charger=SlaveSmartEvse,
-    scan=master_scan,
+    scan=scan_slaves,
     master=Master,
     address=NumberAddress(
         key="slave", lowest=2, highest=4, labelled=True, has_serial=False

@@ -1,4 +1,4 @@
-"""What the user sets up for a SmartEVSE."""
+"""The configuration of a SmartEVSE, as entered by the user."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -10,15 +10,15 @@ from .dialects import UNITS, Dialect
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SmartEvseConfig(ChargerConfig):
-    """A SmartEVSE; its address is its load-balancing setting, mostly.
+    """A SmartEVSE; in most cases its load-balancing setting is its address.
 
-    Raises ValueError for an address that cannot be.
+    Raises ValueError for an address that no box has.
     """
 
     poll_interval: float = 2.0
-    """s; a later one that is polled is left alone for longer, see `timing.QUIET`."""
+    """s; longer for a polled box of a later dialect, see `polled.QUIET`."""
     dialect: Dialect | None = None
-    """``None``: found by probing, on each connect."""
+    """``None``: found by probing after each connect."""
 
     def __post_init__(self) -> None:
         """Check the address."""
@@ -34,7 +34,7 @@ class PolledConfig(SmartEvseConfig):
     live: ClassVar = ChargerConfig.live | {"stop_on_shutdown"}
 
     stop_on_shutdown: bool = False
-    """Turn its access off when everything stops: it has no fail-safe of its own."""
+    """Turn its access off on shutdown: it has no fail-safe of its own."""
 
     def __post_init__(self) -> None:
         """Check the address: slaves stop when no master broadcasts."""
@@ -45,7 +45,7 @@ class PolledConfig(SmartEvseConfig):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SlaveConfig(SmartEvseConfig):
-    """A SmartEVSE set up as slave 1, 2 or 3: unit 2, 3 or 4."""
+    """A SmartEVSE whose load balancing is set to slave 1, 2 or 3: unit 2, 3 or 4."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for an address that no slave has."""

@@ -1,67 +1,94 @@
-"""How a SmartEVSE that is polled may be spoken to: when, in one go, and alone.
+"""One SmartEVSE that is polled: without load balancing, or its own master.
 
-A later box needs quiet: any request on the line, whoever it is for, holds its own 2 s
-cycle up for 4 s; without it no new current counts, and after 10 s it stops with
-NO_COMM. So all that is to be said goes in one burst, and then there is quiet. Only a
-pause does not wait for its end. PROTOCOLS.md, 3.
+It is read before anything is written. Its limit is an override of its own maximum: a
+power failure or a write of 0 removes it, and it applies only while a car charges. So
+it is written before a car comes, read back while the car charges, and reasserted
+whenever the box offers more than the order. 0 A is never written: a pause turns access
+off.
+
+A later box needs quiet: any request on the line, to any address, suspends its own 2 s
+cycle for 4 s; without that cycle no new current takes effect, and after 10 s it stops
+with NO_COMM. So all exchanges that are due go in one burst, followed by quiet time.
+Only a pause does not wait for its end. PROTOCOLS.md, 3.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import ClassVar, Final, override
 
-from ..conversation import FollowUp
-from ..errors import LineBusyError, SharedAddressError
+from ..conversation import FollowUp, rest
+from ..errors import (
+    LineBusyError,
+    NotConfirmedError,
+    RefusedOrderError,
+    SharedAddressError,
+    SupersededError,
+)
 from ..exchange import Request, Turn
-from ..model import Fault, Orders, Persistence, Range, Setting
+from ..model import (
+    MINIMUM_CURRENT,
+    Command,
+    CurrentLimit,
+    Fault,
+    OrderChange,
+    Orders,
+    Persistence,
+    Range,
+    Setting,
+)
+from ..safety import Setpoint, clamp
 from ..schedule import Kind
-from .box import SmartEvseBox
+from .charger import SmartEvseCharger
 from .config import PolledConfig
-from .dialects import Dialect
-from .timing import QUIET, TIMING
+from .dialects import MAPS, Dialect, Status
+from .mode import mode_conversation
+from .reader import READ_AGAIN, TIMING, WRITES
+from .registers import tenths, write_current
+from .states import CHARGING, is_stopped, offered, shows_plug, state_of
 
+QUIET: Final = 6.5
+"""Time without any request on the line that a later box needs, s."""
 COMMANDS_FIRST: Final = 0.05
-"""A poll comes so much later than the end of the quiet, s."""
+"""Pause between the end of the quiet time and a poll, s."""
+SETTLING: Final = 3.0
+"""Longest time in which 2.17 and 2.20 follow a new current, s (their cycle: 2 s)."""
+
+_NO_CHANGE: Final = OrderChange()
+_LOWEST: Final = Orders(limit=CurrentLimit(current=MINIMUM_CURRENT))
 
 
-class PolledBox(SmartEvseBox[PolledConfig]):
+class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
     """One SmartEVSE that has no master, or is its own."""
 
     pauses_hurry: ClassVar = True
     # No other charger has a deadline here, and one burst costs a later box one quiet.
     bursts: ClassVar = True
-    # A power failure opens access that was off: a box that is back is soon seen, and
-    # one that hears us and is not heard still has its quiet.
+    # A power failure opens access that was off, so a box that is back must be read
+    # soon; one that receives but is not received still gets its quiet.
     timing: ClassVar = replace(TIMING, backoff=QUIET, backoff_limit=QUIET)
 
     def __init__(self, config: PolledConfig, orders: Orders) -> None:
-        """Take the set-up; the box is not known before it answers."""
+        """Begin with an unknown box."""
         super().__init__(config, orders)
         self._needs_quiet = False
         self._last_request = 0.0
-        self.leaves = False
-        """It was stopped for good: Home Assistant goes."""
+        """Loop time of the last request on the line."""
+        self._read_at = 0.0
+        """Loop time of the last status."""
+        self._written: int | None = None
+        """The override that we wrote last, 0.1 A; ``None``: not known to be there."""
+        self._confirmed: int | None = None
+        """The set-point within which it was read back to charge, 0.1 A."""
+        self._fell_back = False
+        """It offers more than it had already confirmed."""
+        self._paused_for_limit = False
+        """Our own 0 A has turned its access off; a higher limit restores it."""
+        self._excess: float | None = None
+        """Access was turned off because it kept offering this current, A."""
+        self._shutting_down = False
 
-    # -- What it keeps in its memory -------------------------------------------------
-
-    @property
-    @override
-    def settings(self) -> Mapping[Setting, Range]:
-        ranges = dict(super().settings)
-        if self.configuration is None or not ranges:
-            return ranges
-        # With a minimum above the maximum no car could charge at all.
-        told = self.configuration.settings
-        own = ranges[Setting.MAXIMUM_CURRENT]
-        least = min(max(own.minimum, told[Setting.MINIMUM_CURRENT]), own.maximum)
-        ranges[Setting.MAXIMUM_CURRENT] = replace(own, minimum=least)
-        own = ranges[Setting.MINIMUM_CURRENT]
-        most = max(min(own.maximum, told[Setting.MAXIMUM_CURRENT]), own.minimum)
-        ranges[Setting.MINIMUM_CURRENT] = replace(own, maximum=most)
-        return ranges
-
-    # -- When ------------------------------------------------------------------------
+    # -- When ----------------------------------------------------------------------
 
     @property
     @override
@@ -75,7 +102,7 @@ class PolledBox(SmartEvseBox[PolledConfig]):
             self._needs_quiet = self.dialect is Dialect.LATER
         if not self._needs_quiet:
             return 0.0
-        # Any request counts, whoever it is for and whoever of us has sent it.
+        # Any request counts, to any address and from any of our chargers.
         sent_at = self.bus.wire.sent_at if self.bus is not None else None
         self._last_request = max(self._last_request, sent_at or 0.0)
         return max(0.0, self._last_request + QUIET - now)
@@ -91,22 +118,84 @@ class PolledBox(SmartEvseBox[PolledConfig]):
     @override
     async def poll(self, turn: Turn) -> FollowUp | None:
         if self.minimum_pause(turn.now) > 0:
-            message = f"{self.config.name} is to be left alone: others have asked"
+            message = f"{self.config.name} must be left alone: its quiet was disturbed"
             raise LineBusyError(message)
         return await super().poll(turn)
 
-    # -- Who else is there -------------------------------------------------------------
+    # -- State ---------------------------------------------------------------------
+
+    @property
+    @override
+    def waits_for_current(self) -> bool:
+        return self._paused_for_limit
+
+    @property
+    @override
+    def settings(self) -> Mapping[Setting, Range]:
+        ranges = dict(super().settings)
+        if self.configuration is None or not ranges:
+            return ranges
+        # With a minimum above the maximum no car could charge at all.
+        values = self.configuration.settings
+        own = ranges[Setting.MAXIMUM_CURRENT]
+        least = min(max(own.minimum, values[Setting.MINIMUM_CURRENT]), own.maximum)
+        ranges[Setting.MAXIMUM_CURRENT] = replace(own, minimum=least)
+        own = ranges[Setting.MINIMUM_CURRENT]
+        most = max(min(own.maximum, values[Setting.MAXIMUM_CURRENT]), own.minimum)
+        ranges[Setting.MINIMUM_CURRENT] = replace(own, maximum=most)
+        return ranges
 
     @override
-    async def write(self, turn: Turn, request: Request, register: int) -> bool | None:
-        self._check_alone()
-        return await super().write(turn, request, register)
+    def on_line_open(self) -> None:
+        super().on_line_open()
+        self._written = None
+
+    @override
+    def on_missed(self, now: float) -> None:
+        super().on_missed(now)
+        # It may have been switched off and on again.
+        self._written = None
+
+    @override
+    def on_status(self, status: Status, now: float) -> None:
+        before = self.status
+        if before is not None and before.maximum and status.maximum is None:
+            # Only a restart forgets the cable.
+            self._written = None
+        super().on_status(status, now)
+        self._read_at = now
+        charging = status.raw_state in CHARGING
+        within = charging and not self._is_above(status)
+        setpoint = tenths(self.setpoint)
+        if charging and not within:
+            self._fell_back = self._confirmed == setpoint
+        self._confirmed = setpoint if within else None
+        if status.access and not self.setpoint.paused:
+            # Access was opened at the box: nothing is left to restore.
+            self._paused_for_limit = False
+            self._excess = None
+        settled = self._excess is None and not self._must_stop()
+        if settled and (within or not charging):
+            self.notice(Fault.LIMIT_NOT_TAKEN, present=False)
+
+    def _is_above(self, status: Status, setpoint: Setpoint | None = None) -> bool:
+        """Return whether more than the set-point is offered; False without a car."""
+        wanted = self.setpoint if setpoint is None else setpoint
+        current = offered(self.known_dialect, status)
+        return current is not None and current > wanted.current
+
+    # -- Address -------------------------------------------------------------------
 
     @property
     @override
     def shares_address(self) -> bool:
         others = self.bus is not None and len(self.bus.chargers) > 1
         return self.config.address == 0 and others
+
+    @override
+    async def write(self, turn: Turn, request: Request, register: int) -> bool | None:
+        self._check_alone()
+        return await super().write(turn, request, register)
 
     def _check_alone(self) -> None:
         """Raise SharedAddressError where a write would reach others too.
@@ -121,14 +210,270 @@ class PolledBox(SmartEvseBox[PolledConfig]):
             )
             raise SharedAddressError(message)
 
-    # -- The end ---------------------------------------------------------------------
+    # -- Maintenance ---------------------------------------------------------------
+
+    @override
+    def must_maintain(self, now: float) -> bool:
+        return (
+            super().must_maintain(now)
+            or self._must_stop()
+            or self._must_write()
+            or self._may_start(_NO_CHANGE)
+        )
+
+    @override
+    async def maintain(self, turn: Turn) -> None:
+        await self._stop_if_necessary(turn)
+        if turn.now >= self.configuration_due:
+            # The override is rewritten at times: a short power failure of the box may
+            # have passed unnoticed.
+            self._written = None
+        await super().maintain(turn)
+        # The settings just read may have lowered the set-point.
+        await self._stop_if_necessary(turn)
+        if self._must_write():
+            await self._follow(turn, lambda: self.setpoint)
+        if self._may_start(_NO_CHANGE):
+            # No order took its current away: installation limit, settings or lifetime.
+            await self._enable(turn, _NO_CHANGE)
+
+    async def _stop_if_necessary(self, turn: Turn) -> None:
+        if self._must_stop():
+            ours = self.effective_orders.allowed is not False
+            await self._stop(turn, ours=ours)
+            await rest()
+
+    def _must_stop(self) -> bool:
+        """Return whether a car could charge against the set-point."""
+        if self.status is None or not self.setpoint.paused:
+            return False
+        return not is_stopped(self.known_dialect, self.status)
+
+    async def _stop(self, turn: Turn, *, ours: bool) -> None:
+        """Turn access off; ``ours``: for lack of current, so that it is restored."""
+        had_access = self.status is None or self.status.access
+        try:
+            await self.set_access(turn, allowed=False)
+        except NotConfirmedError:
+            self.notice(Fault.LIMIT_NOT_TAKEN, present=True)
+            raise
+        self._paused_for_limit = ours and (had_access or self._paused_for_limit)
+        if not ours:
+            self._excess = None
+            self.notice(Fault.LIMIT_NOT_TAKEN, present=False)
+
+    def _must_write(self) -> bool:
+        """Return whether the override differs from the one that it should have."""
+        status = self.status
+        if status is None:
+            return False
+        target = self._override_for(status, self.setpoint)
+        if target is None:
+            return False
+        if status.raw_state in CHARGING and self._is_above(status, target):
+            return True
+        return self._written != tenths(target)
+
+    def _override_for(self, status: Status, setpoint: Setpoint) -> Setpoint | None:
+        """Return the override for a status; ``None``: no current is allowed.
+
+        The cable of the next car is unknown before it is plugged in, and the override
+        takes precedence over the box's own knowledge of it: 6 A until then.
+        """
+        dialect = self.known_dialect
+        plugged = (
+            shows_plug(dialect, status) and state_of(dialect, status.raw_state).plugged
+        )
+        if plugged and not setpoint.paused:
+            return setpoint
+        limits = replace(self.limits, reported=MINIMUM_CURRENT, minimum=MINIMUM_CURRENT)
+        lowest = clamp(_LOWEST, limits)
+        return None if lowest.paused else lowest
+
+    # -- The current ---------------------------------------------------------------
+
+    async def _follow(self, turn: Turn, wanted: Callable[[], Setpoint]) -> None:
+        """Write the override; while a car charges, read it back.
+
+        A box that goes on offering more is stopped: a limit must hold. Raises
+        NotConfirmedError then.
+        """
+        sent = None
+        for _ in range(WRITES):
+            await self.reach(turn)
+            status = self.status
+            if status is None:
+                continue
+            if self._fell_back:
+                self.statistics.reasserted += 1
+                self._fell_back = False
+            sent = await self._write_current(turn, status, wanted)
+            if status.raw_state not in CHARGING:
+                return
+            if self.known_dialect is not Dialect.LATER:
+                await rest(READ_AGAIN)
+            await self._settle(turn, wanted)
+            status = self.status
+            setpoint = wanted()
+            if (
+                status is None
+                or status.raw_state not in CHARGING
+                or setpoint.paused
+                or not self._is_above(status, setpoint)
+            ):
+                return
+            await rest()
+        await self._stop_excess(turn, is_current=sent == tenths(wanted()))
+
+    async def _stop_excess(self, turn: Turn, *, is_current: bool) -> None:
+        """Stop a box that does not follow; ``is_current``: the limit has not changed.
+
+        Raises NotConfirmedError, or SupersededError where a newer order came.
+        """
+        status = self.status
+        if status is None:
+            message = f"{self.config.name} did not reply to confirm its limit"
+            raise NotConfirmedError(message)
+        if not is_current:
+            message = "a newer limit came first"
+            raise SupersededError(message)
+        excess = offered(self.known_dialect, status)
+        await self._stop(turn, ours=True)
+        self._excess = excess
+        self.notice(Fault.LIMIT_NOT_TAKEN, present=True)
+        message = (
+            f"{self.config.name} offers {excess:g} A whatever its limit, and has been "
+            "stopped: set MAX in its menu to what may flow, or make it a slave of Home "
+            "Assistant (firmware 2.17 as released takes no limit when it is polled)"
+        )
+        raise NotConfirmedError(message)
+
+    async def _write_current(
+        self, turn: Turn, status: Status, wanted: Callable[[], Setpoint]
+    ) -> int:
+        """Write the override; return the value sent, 0.1 A."""
+        dialect = self.known_dialect
+        sent: list[int] = []
+
+        def request() -> bytes:
+            setpoint = self._override_for(status, wanted())
+            if setpoint is None:
+                message = f"{self.config.name}: no current may be offered"
+                raise RefusedOrderError(message)
+            sent.append(tenths(setpoint))
+            return write_current(self.config.address, dialect, setpoint)
+
+        answer = await self.write(turn, request, MAPS[dialect].current_register)
+        self._written = None if answer is None else sent[-1]
+        return sent[-1]
+
+    async def _settle(self, turn: Turn, wanted: Callable[[], Setpoint]) -> None:
+        """Read the status until the box follows, or has had the time to."""
+        if self.known_dialect is Dialect.LATER:
+            # An earlier read would keep it from following; a poll may come first.
+            written_at = turn.now
+            while self._read_at < written_at:
+                while (pause := self.minimum_pause(turn.now)) > 0:
+                    await rest(pause)
+                if self._read_at < written_at:
+                    await self.read_status(turn)
+            return
+        until = turn.now + SETTLING
+        while True:
+            await self.read_status(turn)
+            status = self.status
+            if (
+                turn.now >= until
+                or status is None
+                or status.raw_state not in CHARGING
+                or offered(self.known_dialect, status) == wanted().current
+            ):
+                return
+            await rest(READ_AGAIN)
+
+    # -- Orders --------------------------------------------------------------------
+
+    @override
+    async def apply(self, turn: Turn, orders: Orders, change: OrderChange) -> None:
+        with self.conversing():
+            await self._prepare(turn, change)
+            if self._wanted(change).paused:
+                if self._must_pause(change):
+                    ours = orders.allowed is not False
+                    await self._stop(turn, ours=ours)
+                return
+            await self._enable(turn, change)
+
+    async def _prepare(self, turn: Turn, change: OrderChange) -> None:
+        """Read the present state, except before a pause of the user."""
+        await self.reach(turn)
+        if change.allowed is False:
+            return
+        await self.read_status(turn)
+        await rest()
+        if self.configuration is None:
+            # Without its own limits it would get 6 A first.
+            await self.read_configuration(turn)
+
+    def _must_pause(self, change: OrderChange) -> bool:
+        """Return whether to send a pause: always where the user has just paused."""
+        return change.allowed is False or (
+            self.status is None or not is_stopped(self.known_dialect, self.status)
+        )
+
+    def _wanted(self, change: OrderChange) -> Setpoint:
+        return clamp(self.order_to_send(change), self.limits)
+
+    async def _enable(self, turn: Turn, change: OrderChange) -> None:
+        """Make the box follow orders with which a car may charge."""
+
+        def wanted() -> Setpoint:
+            return self._wanted(change)
+
+        await self._follow(turn, wanted)
+        await rest()
+        if not self._may_start(change):
+            return
+
+        def still_wanted() -> bool:
+            # A pause that came meanwhile has a conversation of its own.
+            return not (wanted().paused or self._shutting_down)
+
+        await self.set_access(turn, allowed=True, still_wanted=still_wanted)
+        self._paused_for_limit = False
+        self._excess = None
+
+    def _may_start(self, change: OrderChange) -> bool:
+        """Return whether access is to be turned on.
+
+        A start by the user turns it on; a limit only restores access that a limit of
+        0 A has turned off.
+        """
+        if change.allowed is True:
+            return True
+        if not self._paused_for_limit or self.status is None or self.status.access:
+            return False
+        wanted = self._wanted(change)
+        return not wanted.paused and wanted.current >= (self._excess or 0.0)
+
+    # -- Commands ------------------------------------------------------------------
+
+    @override
+    async def command(
+        self, command: Command, value: bool | int | str | None = None
+    ) -> None:
+        if command is not Command.SET_MODE:
+            await super().command(command, value)
+            return
+        conversation = mode_conversation(self, value)
+        await self.run(conversation, persistence=Persistence.REPEATABLE)
 
     @override
     async def on_shutdown(self, *, removed: bool = False) -> None:
         if removed or not self.config.stop_on_shutdown:
             return
-        # A start half done would come to its end after this.
-        self.leaves = True
+        # A start that is half done must not end after this.
+        self._shutting_down = True
         await self.run(
             partial(self.set_access, allowed=False),
             persistence=Persistence.STANDING,

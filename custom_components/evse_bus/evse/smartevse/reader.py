@@ -1,9 +1,11 @@
-"""What is known of one SmartEVSE, and how it is asked: polled or as a slave.
+"""Exchanges with one SmartEVSE, and the last known contents of its registers.
 
-Nothing is written before the box was read since the last (re)connect: the dialect was
-found, and where it tells a serial number, that is the right one. PROTOCOLS.md, 3.
+Nothing is written before the box was read after the last (re)connect: its dialect is
+known, and a serial number that it reports is the expected one. Each turn has one
+exchange at most, so that the broadcast of a master waits for one only. PROTOCOLS.md, 3.
 """
 
+from collections.abc import Callable
 from math import inf
 from typing import ClassVar, Final, override
 
@@ -13,10 +15,13 @@ from ..errors import (
     ExchangeRefusedError,
     ImplausibleReplyError,
     NotAvailableError,
+    NotConfirmedError,
     ReplyTimeoutError,
+    SupersededError,
     WrongChargerError,
 )
-from ..exchange import Turn
+from ..exchange import Request, Turn
+from ..framing import Timing
 from ..model import (
     MINIMUM_CURRENT,
     Capability,
@@ -28,52 +33,72 @@ from ..model import (
 from ..registers import Block
 from .config import SmartEvseConfig
 from .dialects import MAPS, PROBE_A0, Dialect, Status
-from .exchanges import read
-from .probing import Probe
+from .probing import find_dialect
 from .readings import capabilities_of, charger_info, charger_reading
 from .registers import (
     ILLEGAL_ADDRESS,
+    LONGEST_REPLY,
     LONGEST_REQUEST,
     Configuration,
     decode_configuration,
     decode_status,
+    read_answer,
+    read_request,
+    write_access,
+    write_answer,
 )
-from .states import UNPLUGGED, tells_plug
-from .timing import (
-    CONFIGURATION_INTERVAL,
-    ERROR_DOUBT,
-    LOOK_AGAIN,
-    PLUG_DOUBT,
-    TIMING,
+from .states import UNPLUGGED, is_stopped, shows_plug
+
+TIMING: Final = Timing(
+    # More than 3 ms of silence end a frame, and a box replies after more than 6 ms.
+    silence=0.010,
+    silence_patience=0.1,
+    # Network and USB adapters take longer than the box, and merge bytes into lumps.
+    reply_timeout=0.25,
+    gap=0.05,
+    longest_reply=LONGEST_REPLY,
+    retry_pauses=(0.4, 1.0),
 )
 
-LOOKS: Final = 3
-"""How often a box is looked at that does not answer in the midst of something."""
-NOT_UNDERSTOOD: Final = 3
-"""Answers in a row that cannot be, until nothing said before counts any more."""
+READ_AGAIN: Final = 0.5
+"""Pause between two readings of a box that has not replied or followed yet, s."""
+READS: Final = 3
+"""Attempts to read the status of a box in the course of a conversation."""
+WRITES: Final = 2
+"""Attempts to write a value, each followed by its read-back."""
+FAILURES: Final = 3
+"""Implausible or missing replies in a row that make the firmware a doubtful one."""
+CONFIGURATION_INTERVAL: Final = 300.0
+"""Time between two readings of a box's settings, s."""
 CONFIGURATION_RETRY: Final = 30.0
 """Pause after settings that could not be read, s."""
+HIDDEN_BY_ACCESS: Final = 5.0
+"""After access was off, ``A`` may still mean a plugged car for this long, s."""
+HIDDEN_BY_ERROR: Final = 65.0
+"""After an error likewise: a box waits for 60 s before it resumes, s."""
 
 
 class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
-    """One SmartEVSE, as far as it is asked and not told."""
+    """One SmartEVSE: its registers, and access to them."""
 
     timing: ClassVar = TIMING
 
     def __init__(self, config: C, orders: Orders) -> None:
-        """Take the set-up; the box is not known before it answers."""
+        """Begin with an unknown box."""
         super().__init__(config, orders)
         self.dialect: Dialect | None = None
-        """What it speaks; ``None``: not known since the last connect."""
+        """``None``: not known since the last connect."""
         self.status: Status | None = None
-        """What it told last; ``None``: nothing since the last connect."""
+        """The last status; ``None``: not read since the last connect or time-out."""
         self.configuration: Configuration | None = None
         self.configuration_due = 0.0
         """Loop time at which its settings are to be read again."""
+        self.must_close_access = False
+        """Pending cleanup: writing a setting may have opened access that was off."""
         self._serial: str | None = None
-        self._plug_doubted_until = 0.0
-        self._not_understood = 0
-        self._half_known = 0
+        self._plug_hidden_until = 0.0
+        self._implausible_replies = 0
+        self._unanswered_probes = 0
 
     # -- What it is and has --------------------------------------------------------
 
@@ -106,72 +131,6 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
     def longest_request(self) -> int:
         return LONGEST_REQUEST
 
-    @override
-    def on_line_open(self) -> None:
-        self.forget()
-
-    def forget(self) -> None:
-        """Learn anew what it is before anything is written."""
-        self.dialect = None
-        self.status = None
-        self.configuration = None
-        self.configuration_due = 0.0
-        self._plug_doubted_until = 0.0
-
-    @override
-    def on_missed(self, now: float) -> None:
-        super().on_missed(now)
-        # Whoever answers next may be another one: read before anything is written.
-        self.status = None
-
-    # -- Who it is -----------------------------------------------------------------
-
-    async def reach(self, turn: Turn) -> None:
-        """Make sure that we know whom we talk to, and what state it is in.
-
-        Raises ImplausibleReplyError for a box of no known dialect, WrongChargerError
-        for another box, and what `read` raises.
-        """
-        if self.dialect is None:
-            await self._find_dialect(turn)
-            await rest(0.0)
-        if self.status is None:
-            await self.see(turn)
-            await rest(0.0)
-
-    async def _find_dialect(self, turn: Turn) -> None:
-        found = self.config.dialect
-        probe = Probe()
-        while found is None:
-            try:
-                await self._ask(turn, probe)
-            except ImplausibleReplyError:
-                self.notice(Fault.UNSUPPORTED_FIRMWARE, present=True)
-                raise
-            found = probe.found
-            if found is None:
-                await rest(0.0)
-        self.notice(Fault.UNSUPPORTED_FIRMWARE, present=False)
-        self._half_known = 0
-        self.dialect = found
-        self.info = charger_info(found, self._serial)
-
-    async def _ask(self, turn: Turn, probe: Probe) -> None:
-        try:
-            data = await self.read(turn, probe.ask)
-        except ExchangeRefusedError as error:
-            probe.refused(error.code)
-        except ReplyTimeoutError:
-            # It answered a moment ago: to silence here there is more than noise.
-            self._half_known += probe.ask != PROBE_A0
-            if self._half_known >= NOT_UNDERSTOOD:
-                self.notice(Fault.UNSUPPORTED_FIRMWARE, present=True)
-            raise
-        else:
-            probe.told(data)
-
-    # -- What it says --------------------------------------------------------------
-
     @property
     def known_dialect(self) -> Dialect:
         """Return the dialect; raises NotAvailableError before it is known."""
@@ -180,57 +139,62 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
             raise NotAvailableError(message)
         return self.dialect
 
-    async def read(self, turn: Turn, block: Block) -> bytes:
-        """Return the bytes of a block (see `exchanges.read`)."""
-        return await read(turn, self.config.address, block)
+    @override
+    def on_line_open(self) -> None:
+        self.dialect = None
+        self.status = None
+        self.configuration = None
+        self.configuration_due = 0.0
+        self._plug_hidden_until = 0.0
 
-    async def see(self, turn: Turn) -> None:
-        """Look at the box; a lost answer is asked for again."""
-        for last in (False,) * (LOOKS - 1) + (True,):
-            try:
-                await self.look(turn)
-            except ReplyTimeoutError:
-                if last:
-                    raise
-            else:
-                return
-            await rest(LOOK_AGAIN)
+    @override
+    def on_missed(self, now: float) -> None:
+        super().on_missed(now)
+        # The next reply may be another box's: read it before anything is written.
+        self.status = None
 
-    async def look(self, turn: Turn) -> Status:
-        """Read the status, and keep it: one exchange.
+    # -- Identity ------------------------------------------------------------------
 
-        Raises ImplausibleReplyError for what cannot be (it changes nothing),
-        WrongChargerError, and what `read` raises.
+    async def reach(self, turn: Turn) -> None:
+        """Make sure that dialect, identity and status are known.
+
+        Raises ImplausibleReplyError for a box of no known dialect, WrongChargerError
+        for another box, and what `read` raises.
         """
-        dialect = self.known_dialect
-        try:
-            status = decode_status(
-                dialect, await self.read(turn, MAPS[dialect].status.block)
-            )
-        except ExchangeRefusedError as error:
-            if error.code == ILLEGAL_ADDRESS:
-                # Its firmware is another one than a moment ago.
-                self._lose_faith()
-            raise
-        except ImplausibleReplyError:
-            self._not_understood += 1
-            if self._not_understood >= NOT_UNDERSTOOD:
-                self._lose_faith()
-            raise
-        self._not_understood = 0
-        self.notice(Fault.IMPLAUSIBLE, present=False)
-        self._check_identity(status)
-        self.take(status, turn.now)
-        return status
+        if self.dialect is None:
+            await self._identify(turn)
+            await rest()
+        if self.status is None:
+            await self.read_status(turn)
+            await rest()
 
-    def _lose_faith(self) -> None:
-        """Let nothing said before count: this box does not speak as it did."""
-        self._not_understood = 0
-        self.notice(Fault.IMPLAUSIBLE, present=True)
-        self.set_unavailable()
+    async def _identify(self, turn: Turn) -> None:
+        """Find the dialect, unless it is configured; raises as `reach`."""
+
+        async def read(block: Block) -> bytes:
+            if block != PROBE_A0:
+                await rest()
+            try:
+                return await self.read(turn, block)
+            except ReplyTimeoutError:
+                # To PROBE_A0 it has just replied: this silence is not only noise.
+                self._unanswered_probes += block != PROBE_A0
+                if self._unanswered_probes >= FAILURES:
+                    self.notice(Fault.UNSUPPORTED_FIRMWARE, present=True)
+                raise
+
+        try:
+            dialect = self.config.dialect or await find_dialect(read)
+        except ImplausibleReplyError:
+            self.notice(Fault.UNSUPPORTED_FIRMWARE, present=True)
+            raise
+        self.notice(Fault.UNSUPPORTED_FIRMWARE, present=False)
+        self._unanswered_probes = 0
+        self.dialect = dialect
+        self.info = charger_info(dialect, self._serial)
 
     def _check_identity(self, status: Status) -> None:
-        """Make sure that the right box answers, where it tells who it is."""
+        """Raise WrongChargerError where another serial number is reported."""
         if self.dialect is not Dialect.LATER:
             return
         expected = self.config.serial or self._serial
@@ -244,37 +208,111 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
         self._serial = status.serial
         self.info = charger_info(self.dialect, status.serial)
 
-    def take(self, status: Status, now: float) -> None:
-        """Make a reading of a status."""
+    # -- Single exchanges ----------------------------------------------------------
+
+    def guarded(self, request: Request) -> Request:
+        """Return a request with the last check before it is sent; none by default."""
+        return request
+
+    async def read(self, turn: Turn, block: Block) -> bytes:
+        """Return the bytes of a block.
+
+        Raises ExchangeRefusedError and what `Turn.exchange` raises.
+        """
+        unit = self.config.address
+        request = self.guarded(read_request(unit, block))
+        return await turn.exchange(request, read_answer(unit, block))
+
+    async def write(self, turn: Turn, request: Request, register: int) -> bool | None:
+        """Write one register; only a read-back shows whether it took effect.
+
+        True: accepted; False: refused, which may be untrue; ``None``: no reply.
+        Raises ExchangeRefusedError where there is no such register, LineBusyError and
+        LineLostError.
+        """
+        accept = write_answer(self.config.address, register)
+        try:
+            return await turn.exchange(self.guarded(request), accept)
+        except ReplyTimeoutError:
+            return None
+
+    # -- Status --------------------------------------------------------------------
+
+    async def read_status(self, turn: Turn) -> None:
+        """Read the status, up to `READS` times where the reply is missing."""
+        for last in (False,) * (READS - 1) + (True,):
+            try:
+                await self.read_status_once(turn)
+            except ReplyTimeoutError:
+                if last:
+                    raise
+            else:
+                return
+            await rest(READ_AGAIN)
+
+    async def read_status_once(self, turn: Turn) -> None:
+        """Read the status in one exchange.
+
+        Raises ImplausibleReplyError for a reply that no box gives (it changes
+        nothing), WrongChargerError, and what `read` raises.
+        """
         dialect = self.known_dialect
-        if not tells_plug(dialect, status):
-            doubt = ERROR_DOUBT if status.faults else PLUG_DOUBT
-            self._plug_doubted_until = max(self._plug_doubted_until, now + doubt)
+        try:
+            status = decode_status(
+                dialect, await self.read(turn, MAPS[dialect].status.block)
+            )
+        except ExchangeRefusedError as error:
+            if error.code == ILLEGAL_ADDRESS:
+                # Its firmware has changed.
+                self._start_over()
+            raise
+        except ImplausibleReplyError:
+            self._implausible_replies += 1
+            if self._implausible_replies >= FAILURES:
+                self._start_over()
+            raise
+        self._implausible_replies = 0
+        self.notice(Fault.IMPLAUSIBLE, present=False)
+        self._check_identity(status)
+        self.on_status(status, turn.now)
+
+    def _start_over(self) -> None:
+        """Drop what is known of a box that does not reply as it did before."""
+        self._implausible_replies = 0
+        self.notice(Fault.IMPLAUSIBLE, present=True)
+        self.set_unavailable()
+
+    def on_status(self, status: Status, now: float) -> None:
+        """Accept a status, and make a reading of it."""
+        dialect = self.known_dialect
+        if not shows_plug(dialect, status):
+            hidden = HIDDEN_BY_ERROR if status.faults else HIDDEN_BY_ACCESS
+            self._plug_hidden_until = max(self._plug_hidden_until, now + hidden)
         elif status.raw_state != UNPLUGGED:
-            self._plug_doubted_until = 0.0
+            self._plug_hidden_until = 0.0
         self.status = status
         reading = charger_reading(
             dialect,
             status,
             self.configuration,
-            plug_told=now >= self._plug_doubted_until,
+            plug_known=now >= self._plug_hidden_until,
             waits=self.waits_for_current,
         )
         if reading != self.reading:
             self.reading = reading
             self.updated()
 
-    # -- What it keeps in its memory -------------------------------------------------
+    # -- Configuration -------------------------------------------------------------
 
     async def read_configuration(self, turn: Turn) -> None:
-        """Read the settings; what is not told or cannot be changes nothing."""
+        """Read the settings; a missing or implausible reply changes none of them."""
         dialect = self.known_dialect
-        told: dict[Block, bytes] = {}
+        blocks: dict[Block, bytes] = {}
         try:
             for block in MAPS[dialect].configuration:
-                told[block] = await self.read(turn, block)
-                await rest(0.0)
-            configuration = decode_configuration(dialect, told)
+                blocks[block] = await self.read(turn, block)
+                await rest()
+            configuration = decode_configuration(dialect, blocks)
         except ImplausibleReplyError, ReplyTimeoutError, ExchangeRefusedError:
             # Before they are known the limit is 6 A: then each poll tries again.
             pause = CONFIGURATION_RETRY if self.configuration is not None else 0.0
@@ -283,4 +321,59 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
         self.configuration = configuration
         self.configuration_due = turn.now + CONFIGURATION_INTERVAL
         if self.status is not None:
-            self.take(self.status, turn.now)
+            self.on_status(self.status, turn.now)
+
+    # -- Access --------------------------------------------------------------------
+
+    async def set_access(
+        self,
+        turn: Turn,
+        allowed: bool,  # noqa: FBT001
+        still_wanted: Callable[[], bool] = lambda: True,
+    ) -> None:
+        """Set the access bit, and read it back.
+
+        Off is confirmed when no car can charge any more (`states.is_stopped`).
+        ``still_wanted`` is called right before each write, so that a repeated start
+        does not overtake a pause. Raises SupersededError where it returns False,
+        NotConfirmedError when the box does not follow.
+        """
+        await self.reach(turn)
+        dialect = self.known_dialect
+
+        def request() -> bytes:
+            if not still_wanted():
+                message = "a newer command came first"
+                raise SupersededError(message)
+            return write_access(self.config.address, dialect, allowed)
+
+        for _ in range(WRITES):
+            await self.write(turn, request, MAPS[dialect].access_register)
+            if allowed:
+                # Opened on purpose: no cleanup is pending.
+                self.must_close_access = False
+            for pause in (0.0, READ_AGAIN):
+                await rest(pause)
+                await self.read_status(turn)
+                if self._has_access(allowed):
+                    return
+            await rest()
+        state = "on" if allowed else "off"
+        message = f"{self.config.name} does not turn its access {state}"
+        raise NotConfirmedError(message)
+
+    async def close_access(self, turn: Turn) -> None:
+        """Turn access off where a setting has opened it; raises as `set_access`."""
+        await self.read_status(turn)
+        if self.status is None or self.status.access:
+            await rest()
+            await self.set_access(turn, allowed=False)
+        self.must_close_access = False
+
+    def _has_access(self, allowed: bool) -> bool:  # noqa: FBT001
+        """Return whether the last status confirms that access is on, or off."""
+        if self.status is None:
+            return False
+        if allowed:
+            return self.status.access
+        return is_stopped(self.known_dialect, self.status)

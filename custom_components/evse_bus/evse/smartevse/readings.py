@@ -1,12 +1,12 @@
-"""From what a SmartEVSE says to the words that everybody shares. Pure."""
+"""Readings common to all protocols, made from the registers of a SmartEVSE. Pure."""
 
 from typing import Final
 
-from ..model import Capability, Setting, Status as Word
+from ..model import Capability, Setting, Status as OcppStatus
 from ..readings import ChargerInfo, ChargerReading, ConnectorReading
 from .dialects import MAPS, Dialect, Status
 from .registers import Configuration
-from .states import UNPLUGGED, offered, state_of, tells_plug, word_of
+from .states import UNPLUGGED, ocpp_status, offered, shows_plug, state_of
 
 _CAPABILITIES: Final = frozenset(
     {
@@ -29,14 +29,14 @@ _FIRMWARE: Final = {
 
 
 def capabilities_of(dialect: Dialect | None) -> frozenset[Capability]:
-    """Return what a box of a dialect has; ``None``: not known yet."""
+    """Return the capabilities of a dialect; ``None``: those that all have."""
     if dialect is not None and "temperature" in MAPS[dialect].status.words:
         return _CAPABILITIES | {Capability.TEMPERATURE}
     return _CAPABILITIES
 
 
 def charger_info(dialect: Dialect, serial: str | None) -> ChargerInfo:
-    """Return what a box is; the version is what its registers look like."""
+    """Return the identity of a box; its firmware is inferred from its dialect."""
     return ChargerInfo(
         manufacturer="Stegen Electronics",
         model="SmartEVSE v2",
@@ -50,27 +50,26 @@ def charger_reading(
     status: Status,
     configuration: Configuration | None,
     *,
-    plug_told: bool,
+    plug_known: bool,
     waits: bool = False,
 ) -> ChargerReading:
-    """Return what a status tells.
+    """Return the reading of a status.
 
-    ``plug_told``: no access and no error has just hidden a plugged car; without it
-    ``A`` is not taken for "unplugged". ``waits``: it was allowed to charge, and has no
-    access because we have no current for it.
+    ``plug_known``: ``A`` means unplugged; else a missing access or an error may have
+    just hidden a plugged car. ``waits``: paused by us for lack of current.
     """
     state = state_of(dialect, status.raw_state)
     hidden = status.raw_state == UNPLUGGED and not (
-        plug_told and tells_plug(dialect, status)
+        plug_known and shows_plug(dialect, status)
     )
     settings = configuration.settings if configuration is not None else {}
     maxima = (status.maximum, settings.get(Setting.MAXIMUM_CURRENT))
     minimum = status.minimum or settings.get(Setting.MINIMUM_CURRENT)
-    word = word_of(dialect, status)
-    if word is Word.UNAVAILABLE and waits:
-        word = Word.SUSPENDED_EVSE
+    ocpp = ocpp_status(dialect, status)
+    if ocpp is OcppStatus.UNAVAILABLE and waits:
+        ocpp = OcppStatus.SUSPENDED_EVSE
     connector = ConnectorReading(
-        status=word,
+        status=ocpp,
         raw_state=status.raw_state,
         plugged=None if hidden else state.plugged,
         charging=state.charging,

@@ -40,20 +40,6 @@ ILLEGAL_VALUE: Final = 3
 # -- Reading -----------------------------------------------------------------------
 
 
-def dialect_of_a0(data: bytes) -> Dialect | None:
-    """Return the dialect of a reply to `PROBE_A0`; ``None``: neither of the two.
-
-    A letter is 2.17; a number may be 2.20, which `PROBE_A9` must confirm.
-    """
-    for dialect in (Dialect.V2_17, Dialect.V2_20):
-        try:
-            decode_status(dialect, data)
-        except ImplausibleReplyError:
-            continue
-        return dialect
-    return None
-
-
 def decode_status(dialect: Dialect, data: bytes) -> Status:
     """Return the contents of a status block of this dialect.
 

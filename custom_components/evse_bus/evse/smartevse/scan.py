@@ -1,9 +1,7 @@
-"""Looking for a polled SmartEVSE on a bus; nothing is written.
+"""Searching a bus for SmartEVSEs, polled or slaves; nothing is written.
 
-Asked are unit 1 and unit 0: the addresses of a box without load balancing, and of one
-that is its own master. Slaves (2 and up) are not asked: without a master's broadcast
-they stop, so there is nothing to poll. At unit 0 a box answers only in the dialect 2.17
-(and some of 2.20), which there is alone on its bus.
+Every box can be read without being set up, so the configuration and orders that other
+protocols need to search are not used here.
 """
 
 from functools import partial
@@ -16,57 +14,115 @@ from ..errors import (
     GarbledReplyError,
     ImplausibleReplyError,
     LineBusyError,
+    NotAvailableError,
     ReplyTimeoutError,
 )
 from ..exchange import Turn
-from ..model import ChargerConfig, Orders, Setting
+from ..model import ChargerConfig, Fault, Orders, Setting
 from ..protocol import Progress
+from ..registers import Block
 from ..scan import FoundCharger, ScanResult
+from .balancing import SLAVES
 from .dialects import MAPS, Dialect, Status
-from .exchanges import read
-from .probing import Probe
+from .probing import Read, find_dialect
 from .readings import charger_info
-from .registers import decode_configuration, decode_status
+from .registers import (
+    decode_configuration,
+    decode_status,
+    read_answer,
+    read_request,
+)
 
-UNITS: Final = (1, 0)
-"""The more common one first."""
-ASKED: Final = 2
-"""How often a unit is asked that stays silent."""
-ASKED_PATIENTLY: Final = 4
-"""On a line where others talk, or where an answer was unreadable."""
+POLLED_UNITS: Final = (1, 0)
+"""The addresses of a box without load balancing and of one that is its own master, the
+more common one first. At 0 only 2.17 (and some of 2.20) replies, alone on its bus.
+Slaves stop without a master's broadcast, so there is nothing to poll."""
+ATTEMPTS: Final = 2
+"""Requests to a unit that does not reply."""
+ATTEMPTS_ON_BAD_LINE: Final = 4
+"""Requests on a line that is busy, or where a reply was garbled."""
+SLAVE_ATTEMPTS: Final = 3
+"""Requests to a slave: right after power-up, or during a request of its own, it may
+miss one."""
 
 
-async def scan(
+async def scan_polled(
     bus: Bus, config: ChargerConfig, orders: Orders, progress: Progress
 ) -> ScanResult:
-    """Look for a box at both units; nothing is written.
+    """Search for a box at both units; nothing is written.
 
-    ``config`` and ``orders`` are not needed: every box can be read without setting
-    anything. Raises LineLostError when the port is lost meanwhile.
+    Raises LineLostError when the port is lost meanwhile.
     """
     del config, orders
     found: list[FoundCharger] = []
     garbled: list[int] = []
     progress(0.0)
-    for index, unit in enumerate(UNITS):
-        charger, unreadable = await _look_at(bus, unit)
+    for index, unit in enumerate(POLLED_UNITS):
+        charger, unreadable = await _search(bus, unit)
         if charger is not None:
             found.append(charger)
         elif unreadable:
             garbled.append(unit)
-        progress((index + 1) / len(UNITS))
-    if not found and len(garbled) == len(UNITS):
-        # No collision is at both: the line does not fit.
+        progress((index + 1) / len(POLLED_UNITS))
+    if not found and len(garbled) == len(POLLED_UNITS):
+        # Boxes do not collide at both: the line settings do not fit.
         return ScanResult(unreadable=True)
     return ScanResult(found=tuple(found), duplicates=tuple(garbled))
 
 
-async def _look_at(bus: Bus, unit: int) -> tuple[FoundCharger | None, bool]:
-    """Return the box at a unit, and whether what answered could not be read."""
-    silent = garbled = busy = 0
-    while silent < ASKED and silent + garbled + busy < ASKED_PATIENTLY:
+async def scan_slaves(
+    bus: Bus, config: ChargerConfig, orders: Orders, progress: Progress
+) -> ScanResult:
+    """Search for slaves on a bus that we are the master of; nothing is written.
+
+    One exchange a turn, so that the broadcasts of a running bus go on. Beside another
+    master nothing is sent, and the result reports it. Raises LineLostError when the
+    port is lost meanwhile.
+    """
+    del config, orders
+    found: list[FoundCharger] = []
+    unsupported: list[FoundCharger] = []
+    garbled: list[int] = []
+    progress(0.0)
+    for index, unit in enumerate(SLAVES):
         try:
-            return await bus.run(partial(_ask, unit)), False
+            charger, dialect = await _identify(
+                unit, partial(_read_patiently, bus, unit)
+            )
+        except GarbledReplyError:
+            garbled.append(unit)
+        except ReplyTimeoutError, LineBusyError:
+            pass
+        except ImplausibleReplyError, ExchangeRefusedError:
+            # Another Modbus device has this address.
+            pass
+        except NotAvailableError:
+            if not _has_other_master(bus):
+                raise
+            return ScanResult(other_master=True)
+        else:
+            (found if dialect is Dialect.V2_17 else unsupported).append(charger)
+        progress((index + 1) / len(SLAVES))
+    if not found and not unsupported and len(garbled) == len(SLAVES):
+        # Boxes do not collide at all three: the line settings do not fit.
+        return ScanResult(unreadable=True)
+    return ScanResult(
+        found=tuple(found),
+        unsupported=tuple(unsupported),
+        duplicates=tuple(garbled),
+    )
+
+
+def _has_other_master(bus: Bus) -> bool:
+    return bus.master is not None and Fault.SECOND_MASTER in bus.master.noticed
+
+
+async def _search(bus: Bus, unit: int) -> tuple[FoundCharger | None, bool]:
+    """Return the polled box at a unit, and whether replies were garbled."""
+    silent = garbled = busy = 0
+    while silent < ATTEMPTS and silent + garbled + busy < ATTEMPTS_ON_BAD_LINE:
+        try:
+            return await bus.run(partial(_identify_in_a_turn, unit)), False
         except GarbledReplyError:
             garbled += 1
         except ReplyTimeoutError:
@@ -74,44 +130,55 @@ async def _look_at(bus: Bus, unit: int) -> tuple[FoundCharger | None, bool]:
         except LineBusyError:
             busy += 1
         except ImplausibleReplyError, ExchangeRefusedError:
-            # Something else speaks Modbus at this address.
+            # Another Modbus device has this address.
             return None, False
-    return None, garbled >= ASKED
+    return None, garbled >= ATTEMPTS
 
 
-async def _ask(unit: int, turn: Turn) -> FoundCharger:
-    """Return what the box at a unit is.
+async def _identify_in_a_turn(unit: int, turn: Turn) -> FoundCharger:
+    charger, _ = await _identify(unit, partial(_read, unit, turn))
+    return charger
 
-    Raises ImplausibleReplyError where no SmartEVSE answers, and what `read` raises.
+
+async def _identify(unit: int, read: Read) -> tuple[FoundCharger, Dialect]:
+    """Return the box at a unit, and its dialect.
+
+    Raises ImplausibleReplyError for a device that is no SmartEVSE, and what ``read``
+    raises.
     """
-    probe = Probe()
-    while probe.found is None:
-        try:
-            probe.told(await read(turn, unit, probe.ask))
-        except ExchangeRefusedError as error:
-            probe.refused(error.code)
-    dialect = probe.found
-    status = decode_status(dialect, await read(turn, unit, MAPS[dialect].status.block))
+    dialect = await find_dialect(read)
+    status = decode_status(dialect, await read(MAPS[dialect].status.block))
     info = charger_info(dialect, status.serial)
-    return FoundCharger(
+    charger = FoundCharger(
         address=unit,
         info=info,
         serial=info.serial,
-        maximum_current=await _maximum(turn, unit, dialect, status),
+        maximum_current=await _maximum(dialect, status, read),
     )
+    return charger, dialect
 
 
-async def _maximum(
-    turn: Turn, unit: int, dialect: Dialect, status: Status
-) -> float | None:
-    """Return the maximum that a box tells of itself, A; ``None``: not told."""
+async def _maximum(dialect: Dialect, status: Status, read: Read) -> float | None:
+    """Return the maximum that a box reports, A; ``None``: it reports none."""
     try:
-        told = {
-            block: await read(turn, unit, block)
-            for block in MAPS[dialect].configuration
-        }
-        settings = decode_configuration(dialect, told).settings
+        blocks = {block: await read(block) for block in MAPS[dialect].configuration}
+        settings = decode_configuration(dialect, blocks).settings
     except ExchangeError:
         return None if status.maximum is None else float(status.maximum)
     configured = settings[Setting.MAXIMUM_CURRENT]
     return float(min(configured, status.maximum or configured))
+
+
+async def _read_patiently(bus: Bus, unit: int, block: Block) -> bytes:
+    """Return a block, each request in a turn of its own."""
+    for last in (False,) * (SLAVE_ATTEMPTS - 1) + (True,):
+        try:
+            return await bus.run(lambda turn: _read(unit, turn, block))
+        except ReplyTimeoutError, LineBusyError:
+            if last:
+                raise
+    raise ReplyTimeoutError
+
+
+async def _read(unit: int, turn: Turn, block: Block) -> bytes:
+    return await turn.exchange(read_request(unit, block), read_answer(unit, block))

@@ -1,20 +1,20 @@
-"""How slaves of one master share a supply. Pure: times and currents in, currents out.
+"""Sharing a circuit limit among the slaves of one master. Pure: no clock, no line.
 
 All currents are whole 0.1 A, as they go to the wire; times are loop times, s.
 
 A slave (dialect 2.17) closes its contactor only when its request for current is
-granted. From then on it offers what was granted, or what it last heard in a
-broadcast. A broadcast may get lost, so a `Draw` counts every value that a box may
-be following, and a value goes up only by what all of these leave free: first others
-go down and say so, then one goes up. Then, whatever gets lost and whoever falls
-silent, all boxes together never offer more than the limit, as long as two things
-hold, which no master can bring about:
+granted. From then on it offers the current that was granted, or that of the last
+broadcast it received. A broadcast may get lost, so a `Draw` counts every value that a
+box may be following, and a value goes up only by the current that all of these leave
+free: first the others go down and confirm it, then one goes up. Then, whatever gets
+lost and whichever box falls silent, all boxes together never offer more than the
+limit, as long as two conditions hold, which no master can bring about:
 
 - The limit leaves 6 A for every box that charges. Where it does not (it was lowered,
-  or a box cannot be reached), a box goes on with 6 A until it has heard the order to
-  stop, which is sent at once, or until it has heard no broadcast for 10 s.
+  or a box cannot be reached), a box goes on with 6 A until it has received the command
+  to stop, which is sent at once, or until it has missed all broadcasts for 10 s.
 - Before our first broadcast the boxes together kept to the limit. Until each of them
-  was read, or has had time to stop by itself, nobody goes up.
+  was read, or has had time to stop by itself, none goes up.
 
 Source: PROTOCOLS.md, 3, and the manual's registers 0x00* and 0x008*.
 """
@@ -29,21 +29,20 @@ from ..model import MAXIMUM_CURRENT, MINIMUM_CURRENT, Supply
 from ..safety import number, round_down
 
 LOWEST: Final = 60
-"""0.1 A; a box that charges offers no less, whatever it hears."""
+"""0.1 A; a box that charges offers no less, whatever it receives."""
 HIGHEST: Final = 800
-"""0.1 A; a box takes more for nonsense, and offers the lowest."""
+"""0.1 A; a box ignores a higher value, and offers the lowest."""
 STOPS_ALONE: Final = 12.0
 """Time without a broadcast after which a box has stopped by itself, s (10 to 11)."""
 
-
 _STEP: Final = 0.1
-"""A, of the wire."""
+"""A, on the wire."""
 
 
 def checked(supply: Supply) -> Supply:
-    """Return a supply on the step of the wire.
+    """Return a supply, rounded down to the step of the wire.
 
-    Raises RefusedOrderError for one that cannot be shared.
+    Raises RefusedOrderError for values out of range.
     """
     limit = number(supply.limit, "limit of the supply")
     minimum = number(supply.minimum, "minimum of a charger")
@@ -54,7 +53,7 @@ def checked(supply: Supply) -> Supply:
 
 
 def offered(value: int) -> int:
-    """Return what a charging box offers when it hears this value, 0.1 A."""
+    """Return the current a charging box offers after this broadcast value, 0.1 A."""
     return value if LOWEST <= value <= HIGHEST else LOWEST
 
 
@@ -62,46 +61,46 @@ class Draw:
     """The most that one box may be offering a car, from all that is known of it."""
 
     def __init__(self, unknown_until: float = -inf) -> None:
-        """Know nothing; what it did before, it has stopped by ``unknown_until``."""
+        """Know nothing; an earlier charge has stopped by ``unknown_until``."""
         self.may_draw = True
-        """Its contactor may be closed; only a reading can say that it is not."""
+        """Its contactor may be closed; only a reading can show that it is not."""
         self._unknown_until = unknown_until
         self._read: tuple[float, int] | None = None
-        self._said: list[tuple[float, int]] = []
+        self._sent: list[tuple[float, int]] = []
         self._granted: tuple[float, int] | None = None
         self._floor: int | None = None
 
     def most(self, now: float) -> float:
-        """Return the most that it may be offering now, 0.1 A; inf: nobody knows."""
+        """Return the most that it may be offering now, 0.1 A; inf: unknown."""
         if not self.may_draw:
             return 0
         if now < self._unknown_until:
             return inf
-        # What it follows it has heard less than that ago, or it has stopped.
+        # The value it follows is younger than that, or it has stopped.
         recent = now - STOPS_ALONE
-        values = [value for when, value in self._said if when > recent]
+        values = [value for when, value in self._sent if when > recent]
         others = (one for one in (self._read, self._granted) if one is not None)
         values.extend(value for when, value in others if when > recent)
         return max(values, default=0)
 
     @property
     def floor(self) -> int:
-        """Return the least that it may have heard last, 0.1 A; 0: perhaps nothing."""
+        """Return the least value it may have received last, 0.1 A; 0: maybe none."""
         return self._floor or 0
 
-    def said(self, value: int, now: float) -> None:
-        """Note a value of a broadcast that goes out now; it may get lost."""
+    def sent(self, value: int, now: float) -> None:
+        """Note a value of a broadcast that is sent now; it may get lost."""
         recent = now - STOPS_ALONE
-        self._said = [one for one in self._said if one[0] > recent]
-        self._said.append((now, offered(value)))
+        self._sent = [one for one in self._sent if one[0] > recent]
+        self._sent.append((now, offered(value)))
         if self._floor is not None:
             self._floor = min(self._floor, value)
 
     def granted(self, value: int, now: float) -> None:
         """Note that a request for current is granted now; that may get lost, too."""
         if not self.may_draw:
-            # Nothing of the time before can count: the contactor was open.
-            self._said.clear()
+            # The contactor was open: earlier values no longer count.
+            self._sent.clear()
             self._read = None
             self._granted = None
         self.may_draw = True
@@ -110,23 +109,23 @@ class Draw:
         self._granted = (now, offered(value))
 
     def read(self, value: int, now: float, *, closed: bool) -> None:
-        """Note what the box told: the value it heard last, and its contactor."""
+        """Note a reading: the value the box received last, and its contactor."""
         self.may_draw = closed
         self._unknown_until = -inf
         self._read = (now, offered(value))
-        self._said.clear()
+        self._sent.clear()
         self._floor = value
-        # It heard no less before the grant: so it has heard a broadcast since. (0 may
-        # also be the memory of a box that was switched off and on.)
+        # No lower value was sent before the grant: so it has received a broadcast
+        # since. (0 may also be the memory of a box that was switched off and on.)
         grant = self._granted
         if not closed or (grant is not None and 0 < value < grant[1]):
             self._granted = None
 
-    def asked(self, now: float) -> None:
-        """Note a request: whoever asks has its contactor open.
+    def requested(self, now: float) -> None:
+        """Note a request: a box that requests current has its contactor open.
 
-        Unless something was granted of late: then it may be an echo of what was
-        asked before, and only a reading counts.
+        Unless a request was granted of late: then this one may be an echo of it, and
+        only a reading counts.
         """
         if self._granted is None or now - self._granted[0] > STOPS_ALONE:
             self.may_draw = False
@@ -135,44 +134,44 @@ class Draw:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Claim:
-    """What one box asks of the supply."""
+    """The claim of one box to a share of the circuit limit."""
 
     unit: int
-    wish: int
+    demand: int
     """Most that it could use, 0.1 A; below the lowest: nothing."""
-    came: float = 0.0
-    """The first come keeps its share when there is not enough."""
+    since: float = 0.0
+    """Loop time at which its charge began, s: the earliest goes first."""
     fixed: bool = False
-    """It may be charging and nobody can stop it now: it has its 6 A before all."""
+    """It may be charging and cannot be stopped now: 6 A is reserved for it first."""
 
 
 def split(limit: int, minimum: int, claims: Iterable[Claim]) -> dict[int, int]:
-    """Return each unit's share, 0.1 A: 0, or from the minimum up to its wish.
+    """Return each unit's share, 0.1 A: 0, or from the minimum up to its demand.
 
-    Each gets the minimum (its wish, where that is less), first come, first served;
-    what is left goes in equal parts to those who can use it.
+    Each gets the minimum (its demand, where that is less), first come, first served;
+    the rest goes in equal parts to those that can use it.
     """
-    ordered = sorted(claims, key=lambda claim: (not claim.fixed, claim.came))
+    ordered = sorted(claims, key=lambda claim: (not claim.fixed, claim.since))
     shares = {claim.unit: 0 for claim in ordered}
-    wishes: dict[int, int] = {}
+    demands: dict[int, int] = {}
     for claim in ordered:
         if claim.fixed:
             limit -= LOWEST
-            shares[claim.unit] = LOWEST if claim.wish >= LOWEST else 0
+            shares[claim.unit] = LOWEST if claim.demand >= LOWEST else 0
             continue
-        need = min(max(minimum, LOWEST), claim.wish)
+        need = min(max(minimum, LOWEST), claim.demand)
         if LOWEST <= need <= limit:
             limit -= need
             shares[claim.unit] = need
-            if need < claim.wish:
-                wishes[claim.unit] = claim.wish
-    while wishes and (part := limit // len(wishes)) > 0:
-        for unit, wish in tuple(wishes.items()):
-            more = min(part, wish - shares[unit])
+            if need < claim.demand:
+                demands[claim.unit] = claim.demand
+    while demands and (part := limit // len(demands)) > 0:
+        for unit, demand in tuple(demands.items()):
+            more = min(part, demand - shares[unit])
             shares[unit] += more
             limit -= more
-            if shares[unit] == wish:
-                del wishes[unit]
+            if shares[unit] == demand:
+                del demands[unit]
     return shares
 
 
@@ -184,58 +183,59 @@ def most_of_all(draws: Iterable[Draw], now: float) -> float:
 def next_values(
     limit: int, shares: Mapping[int, int], draws: Mapping[int, Draw], now: float
 ) -> dict[int, int]:
-    """Return what the next broadcast may tell each unit, 0.1 A.
+    """Return the value of the next broadcast for each unit, 0.1 A.
 
-    Down to its share at once; up only by what nobody can be using.
+    Down to its share at once; up only by current that no box can be using.
     """
     free = max(0.0, limit - most_of_all(draws.values(), now))
     values: dict[int, int] = {}
     for unit, share in shares.items():
         draw = draws[unit]
         most = draw.most(now)
+        value = share
         if most == inf:
-            share = min(share, LOWEST)  # noqa: PLW2901 - what of it may be said now
+            value = min(share, LOWEST)
         elif draw.may_draw and share > most:
             more = int(min(free, share - most))
             free -= more
-            share = int(most) + more  # noqa: PLW2901 - what of it may be said now
-        values[unit] = share
+            value = int(most) + more
+        values[unit] = value
     return values
 
 
-def together(
+def fit_to_limit(
     limit: int, values: Mapping[int, int], active: Iterable[int]
 ) -> dict[int, int]:
     """Return the values with which one broadcast keeps to the limit, 0.1 A.
 
-    The ``active`` draw, or are about to. Where they would offer too much, because one
-    is still being stopped, the others go down to the lowest meanwhile. What they leave
-    goes in equal parts to boxes that draw nothing: nobody who adds up the values of
-    a broadcast shall find more than there is.
+    The ``active`` units draw current, or are about to. Where they would offer too
+    much, because one is still being stopped, the others go down to the lowest
+    meanwhile. The rest goes in equal parts to boxes that draw nothing, so that the sum
+    of all values of a broadcast is never above the limit.
     """
     active = [unit for unit in values if unit in set(active)]
-    said = dict(values)
-    left = limit - sum(offered(said[unit]) for unit in active)
+    fitted = dict(values)
+    left = limit - sum(offered(fitted[unit]) for unit in active)
     for unit in active:
-        less = min(max(-left, 0), max(said[unit] - LOWEST, 0))
-        said[unit] -= less
+        less = min(max(-left, 0), max(fitted[unit] - LOWEST, 0))
+        fitted[unit] -= less
         left += less
     idle = [unit for unit in values if unit not in active]
     part = max(left, 0) // max(len(idle), 1)
     for unit in idle:
-        value = min(said[unit], part)
-        said[unit] = value if value >= LOWEST else 0
-    return said
+        value = min(fitted[unit], part)
+        fitted[unit] = value if value >= LOWEST else 0
+    return fitted
 
 
 def grant(
     limit: int, share: int, unit: int, draws: Mapping[int, Draw], now: float
 ) -> int:
-    """Return the current that a request of this unit may be granted, 0.1 A; 0: none.
+    """Return the current to grant to a request of this unit, 0.1 A; 0: none.
 
-    ``share`` is what it gets when all have followed. It is granted no more than it
-    has surely heard in broadcasts (or the lowest): then a lower value that it reads
-    back later shows that it has heard a later broadcast.
+    ``share`` is its share once all have followed. It is granted no more than it has
+    surely received in broadcasts (or the lowest): then a lower value in a later
+    reading shows that it has received a later broadcast.
     """
     free = limit - most_of_all(
         (draw for other, draw in draws.items() if other != unit), now
@@ -248,7 +248,7 @@ def grant(
     return value if most <= free else 0
 
 
-def in_the_way(
+def above_share(
     shares: Mapping[int, int], draws: Mapping[int, Draw], now: float
 ) -> Sequence[int]:
     """Return the units that may still be offering more than their share."""

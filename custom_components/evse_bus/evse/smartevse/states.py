@@ -1,15 +1,15 @@
-"""The states of a SmartEVSE v2, and what can be said from them.
+"""The states of a SmartEVSE v2 and their meaning. Pure.
 
 Source: README of v2, register 0x00A0 (A to H, T), README of later versions, register
-0x0000 (B1, C1), and PROTOCOLS.md, 3. Where access is off, 2.17 and 2.20 say ``A``
-whatever is plugged in; later ones say B1, or C1 for the seconds in which the car ends.
+0x0000 (B1, C1), and PROTOCOLS.md, 3. With access off, 2.17 and 2.20 report ``A`` also
+for a plugged car; later ones report B1, or C1 for the seconds until the car has ended.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from ..model import MAXIMUM_CURRENT, MINIMUM_CURRENT, Fault, Status as Word
+from ..model import MAXIMUM_CURRENT, MINIMUM_CURRENT, Fault, Status as OcppStatus
 from .dialects import Dialect, Status
 
 UNPLUGGED: Final = "A"
@@ -25,56 +25,56 @@ _STOPPED_BY: Final = frozenset({Fault.NO_COMM, Fault.TEMP_HIGH, Fault.RCD})
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class State:
-    """What a state says by itself; ``None``: not told."""
+    """The meaning of a state by itself; ``None``: unknown."""
 
-    status: Word
+    status: OcppStatus
     plugged: bool | None
     charging: bool | None = False
     offers: bool | None = False
-    """The pilot tells the car a current; ``None``: nobody is told one."""
+    """The pilot offers a current; ``None``: there is no car to offer it to."""
 
 
-_PREPARING: Final = State(status=Word.PREPARING, plugged=True)
+_PREPARING: Final = State(status=OcppStatus.PREPARING, plugged=True)
 _COMMON: Final[Mapping[str, State]] = {
-    "A": State(status=Word.AVAILABLE, plugged=False, offers=None),
-    # The car may draw current, and does not: not yet, or not any more.
-    "B": State(status=Word.SUSPENDED_EV, plugged=True, offers=True),
-    "C": State(status=Word.CHARGING, plugged=True, charging=True, offers=True),
-    "D": State(status=Word.CHARGING, plugged=True, charging=True, offers=True),
-    # Wakes a car up: for 3 s the pilot says that there is no charger.
-    "T": State(status=Word.SUSPENDED_EV, plugged=True),
-    "B1": State(status=Word.SUSPENDED_EVSE, plugged=True),
-    "C1": State(status=Word.SUSPENDED_EVSE, plugged=True, charging=None),
+    "A": State(status=OcppStatus.AVAILABLE, plugged=False, offers=None),
+    # The car may draw current and does not: not yet, or no longer.
+    "B": State(status=OcppStatus.SUSPENDED_EV, plugged=True, offers=True),
+    "C": State(status=OcppStatus.CHARGING, plugged=True, charging=True, offers=True),
+    "D": State(status=OcppStatus.CHARGING, plugged=True, charging=True, offers=True),
+    # Wakes a car up: for 3 s the pilot is as if there were no charger.
+    "T": State(status=OcppStatus.SUSPENDED_EV, plugged=True),
+    "B1": State(status=OcppStatus.SUSPENDED_EVSE, plugged=True),
+    "C1": State(status=OcppStatus.SUSPENDED_EVSE, plugged=True, charging=None),
 }
 _V2_17: Final[Mapping[str, State]] = {
     **_COMMON,
-    # Waiting for the master's word: to A, to B, to C, from C to B.
-    "E": State(status=Word.FINISHING, plugged=False),
+    # Waiting for the master's answer: to A, to B, to C, from C to B.
+    "E": State(status=OcppStatus.FINISHING, plugged=False),
     "F": _PREPARING,
-    "G": State(status=Word.PREPARING, plugged=True, offers=True),
-    "H": State(status=Word.FINISHING, plugged=True),
+    "G": State(status=OcppStatus.PREPARING, plugged=True, offers=True),
+    "H": State(status=OcppStatus.FINISHING, plugged=True),
 }
 _NUMBERED: Final[Mapping[str, State]] = {
     **_COMMON,
-    # Asking for B, told to go to B, asking for C, told to go to C.
+    # B requested, B granted, C requested, C granted.
     "E": _PREPARING,
     "F": _PREPARING,
-    "G": State(status=Word.PREPARING, plugged=True, offers=True),
-    "H": State(status=Word.PREPARING, plugged=True, offers=True),
+    "G": State(status=OcppStatus.PREPARING, plugged=True, offers=True),
+    "H": State(status=OcppStatus.PREPARING, plugged=True, offers=True),
 }
 
 
 def state_of(dialect: Dialect, raw_state: str) -> State:
-    """Return what a state says; all that `decode_status` tells are known."""
+    """Return the meaning of a state; each that `decode_status` returns has one."""
     table = _V2_17 if dialect is Dialect.V2_17 else _NUMBERED
     return table[raw_state]
 
 
-def tells_plug(dialect: Dialect, status: Status) -> bool:
-    """Return whether the state says if a car is plugged in.
+def shows_plug(dialect: Dialect, status: Status) -> bool:
+    """Return whether the state shows if a car is plugged in.
 
-    FollowUp boxes keep the pilot in sight (B1); before, ``A`` also stands for "stopped"
-    where access is off or an error is set.
+    Later boxes report a plugged car without access (B1); the others report ``A`` for
+    it, and also while an error has stopped it.
     """
     if status.raw_state != UNPLUGGED or dialect is Dialect.LATER:
         return True
@@ -82,7 +82,7 @@ def tells_plug(dialect: Dialect, status: Status) -> bool:
 
 
 def is_stopped(dialect: Dialect, status: Status) -> bool:
-    """Return whether a box with access off has also obeyed it."""
+    """Return whether access is off and the box has obeyed it."""
     if status.access:
         return False
     # A later one that wakes a car up (T) goes on to B, and from there to C.
@@ -90,9 +90,9 @@ def is_stopped(dialect: Dialect, status: Status) -> bool:
 
 
 def offered(dialect: Dialect, status: Status) -> float | None:
-    """Return the current that the pilot offers the car, A; ``None``: to nobody.
+    """Return the current that the pilot offers, A; ``None``: there is no car.
 
-    Where the box has no current to say it says 6 A (PROTOCOLS.md, 3).
+    A box whose current is out of range offers 6 A (PROTOCOLS.md, 3).
     """
     offers = state_of(dialect, status.raw_state).offers
     if offers is None:
@@ -104,17 +104,17 @@ def offered(dialect: Dialect, status: Status) -> float | None:
     return MINIMUM_CURRENT
 
 
-def word_of(dialect: Dialect, status: Status) -> Word:
-    """Return the state in the words of OCPP.
+def ocpp_status(dialect: Dialect, status: Status) -> OcppStatus:
+    """Return the state as a status of OCPP.
 
-    ``A`` without access is "unavailable": whether a car waits there, the box does not
-    say. An error that stops it is a fault; a lack of current or sun only a wait.
+    ``A`` without access is "unavailable": a car may be plugged in or not. An error
+    that stops the box is a fault; a lack of current or sun is a pause.
     """
     if status.faults & _STOPPED_BY:
-        return Word.FAULTED
+        return OcppStatus.FAULTED
     if status.raw_state == UNPLUGGED:
         if not status.access:
-            return Word.UNAVAILABLE
+            return OcppStatus.UNAVAILABLE
         if status.faults:
-            return Word.SUSPENDED_EVSE
+            return OcppStatus.SUSPENDED_EVSE
     return state_of(dialect, status.raw_state).status
