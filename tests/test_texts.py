@@ -23,6 +23,9 @@ from custom_components.evse_bus.errors import (
 )
 from custom_components.evse_bus.evse.ews.wire.answers import Refusal
 from custom_components.evse_bus.evse.ews.wire.parameters import HiddenSecretError
+from custom_components.evse_bus.evse.options import Choice, HexBytes, Quantity
+from custom_components.evse_bus.evse.protocol import Protocol
+from custom_components.evse_bus.evse.protocols import PROTOCOLS
 from custom_components.evse_bus.issues import (
     DUPLICATE_ADDRESS,
     LOST,
@@ -133,3 +136,32 @@ def test_issues_have_texts() -> None:
         UNSUPPORTED_FIRMWARE,
         WRONG_CHARGER,
     }
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS.values(), ids=PROTOCOLS)
+def test_protocols_have_texts(protocol: Protocol) -> None:
+    form, make = protocol.address, protocol.make
+    config = english()["config"]
+    subentry = english()["config_subentries"]["charger"]
+    assert make.key in english()["selector"]["protocol"]["options"]
+    if make.menu:
+        assert protocol.choice in config["step"][make.menu]["menu_options"]
+    if form.single:
+        assert f"one_{make.key}" in subentry["abort"]
+    if not protocol.dials_in:
+        assert f"scan_{protocol.key}" in config["progress"]
+    for texts in (config, subentry):
+        assert f"confirm_{protocol.key}" in texts["step"]
+        assert form.error in texts["error"]
+        step = texts["step"]["charger" if protocol.ports == 1 else "box"]
+        for option in protocol.options:
+            place = step if option.prominent else step["sections"]["expert"]
+            assert option.name in place["data"]
+            assert option.name in place["data_description"]
+            if isinstance(option, HexBytes | Quantity):
+                assert f"bad_{option.name}" in texts["error"]
+            if isinstance(option, Choice):
+                labels = english()["selector"][option.name]["options"]
+                assert labels.keys() == option.values.keys()
+                if option.alone:
+                    assert f"{option.name}_not_alone" in texts["error"]

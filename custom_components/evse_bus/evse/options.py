@@ -48,10 +48,12 @@ class Toggle(Option):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Quantity(Option):
-    """A finite number in a range."""
+    """A number in a range."""
 
     lowest: float
     highest: float
+    whole: bool = True
+    """A whole number; otherwise a float."""
     step: float = 1
     unit: str
 
@@ -59,7 +61,11 @@ class Quantity(Option):
     def store(self, typed: Any) -> float:
         if not self.lowest <= (number := float(typed)) <= self.highest:
             raise ValueError(typed)
-        return number
+        if not self.whole:
+            return number
+        if not number.is_integer():
+            raise ValueError(typed)
+        return int(number)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
