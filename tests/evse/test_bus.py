@@ -79,7 +79,8 @@ def test_a_charger_is_gone_after_three_misses_and_found_again() -> None:
             await asyncio.sleep(600)
             pauses = bus.line.times(1)[-5:]
             gaps = [b - a for a, b in itertools.pairwise(pauses)]
-            assert all(30 <= gap < 31 for gap in gaps)
+            # No longer than the back-off; shorter after a silent line was renewed.
+            assert all(gap < 31 for gap in gaps)
             device.alive = True
             await asyncio.sleep(31)
             assert charger.available
@@ -425,13 +426,14 @@ def test_a_lost_port_is_opened_again_and_commands_are_not_replayed() -> None:
             bus.bus.subscribe(lambda: told.append(bus.bus.connected))
             bus.line.refuse_open = PortMissingError("gone")
             bus.line.unplug()
+            await asyncio.sleep(0)
             assert not bus.charger(1).available
             with pytest.raises(LineLostError):
                 await bus.charger(1).change_orders(OrderChange(current=20.0))
             await asyncio.sleep(100)
             bus.line.refuse_open = None
             count = len(bus.line.sent)
-            await asyncio.sleep(35)
+            await asyncio.sleep(10)
             assert bus.charger(1).available
             assert told == [False, True]
             assert "W" not in {sent.command for sent in bus.line.sent[count:]}

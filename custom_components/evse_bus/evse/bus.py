@@ -34,10 +34,6 @@ from .throttle import LogThrottle, RateLimiter
 
 _LOGGER = logging.getLogger(__name__)
 
-REOPEN_FIRST: Final = 1.0
-"""First pause before a lost port is opened again, s; doubles."""
-REOPEN_LIMIT: Final = 30.0
-"""Longest such pause, s."""
 STOP_PATIENCE: Final = 6.0
 """Longest time a stop waits for a conversation begun (waking a car: 3 s), s."""
 FAILURE_PAUSE: Final = 1.0
@@ -102,6 +98,8 @@ class Bus(Observable):
         self.group = group
         self.master = group if isinstance(group, BusMaster) else None
         self._was_open = False
+        self._loss: LineLostError | None = None
+        """Why the port was closed, until the first attempt to open it again."""
         self._log = LogThrottle(opened_by_peer=line.opened_by_peer)
         self._jobs = JobQueue()
         self._task: asyncio.Task[None] | None = None
@@ -267,6 +265,8 @@ class Bus(Observable):
         while True:
             slot = None
             try:
+                if self.now >= self._renew_at:
+                    await self._renew()
                 if not self.line.is_open and not await self._reopen():
                     return
                 slots = self._slots()
@@ -275,7 +275,8 @@ class Bus(Observable):
                 choice = choose(slots, self.now, self._last_probe)
                 slot = choice.slot
                 if slot is None:
-                    await self._timer.sleep_until(choice.wake_at)
+                    wake_at = min(choice.wake_at, self._renew_at)
+                    await self._timer.sleep_until(wake_at)
                     continue
                 self.wire.statistics.for_deadline += choice.for_deadline
                 await self._serve(slot)
@@ -442,6 +443,7 @@ class Bus(Observable):
     # -- The port ----------------------------------------------------------------
 
     def _on_open(self) -> None:
+        was_connected = self.connected
         self.connected = self._was_open = True
         self.wire.reset()
         now = self.now
@@ -451,18 +453,46 @@ class Bus(Observable):
             charger.slot.ready = now + charger.minimum_pause(now)
         if self.master is not None:
             self.master.on_line_open(now)
-        self.updated()
+        if not was_connected:
+            self.updated()
 
     def _on_lost(self, error: LineLostError) -> None:
-        self._log.lost(self.name, error, self.now)
-        self.connected = False
         self.wire.fail(error)
         self._jobs.fail_all(error)
+        if self.wire.recovery.worked and not self.line.opened_by_peer:
+            # Some adapters close an idle connection: it is opened again at once, and
+            # a charger that then answers was never unavailable.
+            self._loss = error
+        else:
+            self._set_disconnected(error)
+        self.reschedule()
+
+    def _set_disconnected(self, error: LineLostError) -> None:
+        self._loss = None
+        self._log.lost(self.name, error, self.now)
+        self.connected = False
         if self.master is not None:
             self.master.slot.start_by = inf
         self._abandon_chargers()
         self.updated()
-        self.reschedule()
+
+    @property
+    def _renew_at(self) -> float:
+        """Return when a silent line is to be opened anew, loop time; inf: never."""
+        # A box that dials finds out by itself, and dials again.
+        if self._stopping or self.line.opened_by_peer:
+            return inf
+        return self.wire.recovery.renew_at
+
+    async def _renew(self) -> None:
+        """Close a line on which no byte comes any more; it is opened anew at once."""
+        _LOGGER.debug("%s: no reply any more, the port is opened anew", self.name)
+        self.wire.recovery.renewed()
+        self.wire.statistics.renewed += 1
+        error = LineLostError("no reply any more, the port is opened anew")
+        self._jobs.fail_all(error)
+        await self.line.close()
+        self._loss = error
 
     def silence(self, why: str) -> None:
         """Fail all waiting commands and drop all readings: the bus falls silent."""
@@ -476,10 +506,13 @@ class Bus(Observable):
             charger.set_unavailable()
 
     async def _reopen(self) -> bool:
-        """Open the port again, however long it takes; False when told to stop."""
-        pause = REOPEN_FIRST
+        """Open the port again, however long it takes; False when told to stop.
+
+        At once where its connection has worked until now.
+        """
         while True:
-            if not self._stopping:
+            if self._loss is None and not self._stopping:
+                pause = self.wire.recovery.next_pause()
                 await self._timer.sleep_until(self.now + pause)
             if self._stopping:
                 return False
@@ -487,11 +520,14 @@ class Bus(Observable):
                 await self.line.open()
             except LineError as error:
                 _LOGGER.debug("%s: the port is still missing: %s", self.name, error)
-                pause = min(pause * 2, REOPEN_LIMIT)
+                if self._loss is not None:
+                    self._set_disconnected(self._loss)
                 continue
             if self._was_open:
-                self._log.back(self.name)
+                if self._loss is None:
+                    self._log.back(self.name)
                 self.wire.statistics.reopened += 1
+            self._loss = None
             self._on_open()
             return True
 

@@ -17,6 +17,7 @@ from .errors import (
 )
 from .framing import Frame, Framer, Timing
 from .line import Line
+from .recovery import LineRecovery
 from .statistics import BusStatistics, ChargerStatistics, Direction, FrameLog
 
 _BASE_REQUEST: Final = 64
@@ -36,6 +37,7 @@ class Wire:
         self.timing = timing
         self.statistics = BusStatistics()
         self.frames = FrameLog()
+        self.recovery = LineRecovery()
         self.on_unsolicited: Callable[[Frame], bool] = lambda _frame: False
         """Called with a good frame that is no reply; returns whether it was used."""
         self.sent_at: float | None = None
@@ -61,6 +63,7 @@ class Wire:
     def reset(self) -> None:
         """Drop an incomplete frame: the line was opened anew."""
         self._framer.reset()
+        self.recovery.opened()
 
     def fail(self, error: LineLostError) -> None:
         """End the exchange under way: the line is gone."""
@@ -101,6 +104,8 @@ class Wire:
         except ReplyTimeoutError as error:
             self.statistics.timeouts += 1
             counted.timeouts += 1
+            if self._received_at < started:
+                self.recovery.unanswered(loop.time())
             self._framer.reset()
             unreadable = self._framer.bad - bad
             if unreadable or self._framer.noise > noise:
@@ -160,6 +165,7 @@ class Wire:
 
     def _on_data(self, data: bytes) -> None:
         self._received_at = asyncio.get_running_loop().time()
+        self.recovery.received()
         framer = self._framer
         bad, noise = framer.bad, framer.noise
         frames = framer.feed(data)

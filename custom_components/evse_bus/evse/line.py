@@ -7,7 +7,6 @@ its own transmission (common on two-wire RS-485).
 
 import asyncio
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 import errno
 import socket
@@ -31,10 +30,10 @@ from .errors import (
 )
 from .framing import LineSettings
 
-OPEN_TIMEOUT = 10.0
+OPEN_TIMEOUT = 4.0
 """Longest wait for a port to open (a network port may not answer), s."""
-CLOSE_TIMEOUT = 5.0
-"""Longest wait for a port to close, s."""
+CLOSE_TIMEOUT = 1.0
+"""Longest wait for a port to close, s; then it is closed without its last bytes."""
 
 _PARITIES = {"N": Parity.NONE, "E": Parity.EVEN, "O": Parity.ODD}
 _STOP_BITS = {1: StopBits.ONE, 2: StopBits.TWO}
@@ -140,10 +139,15 @@ class Line:
         if transport is None:
             return
         transport.close()
-        # A port that was unplugged reports so once more here.
-        with suppress(OSError, SerialException):
+        try:
             async with asyncio.timeout(CLOSE_TIMEOUT):
                 await transport.wait_closed()
+        except TimeoutError:
+            # Bytes that a dead connection never takes would keep it open.
+            transport.abort()
+        except OSError, SerialException:
+            # A port that was unplugged reports so once more here.
+            pass
 
     def write(self, data: bytes, *, reply_may_equal: bool = False) -> float:
         """Send bytes; return the loop time at which the last one has left.

@@ -41,6 +41,8 @@ class BusStatistics:
     line_busy: int = 0
     """Turns given up because the line was never quiet."""
     reopened: int = 0
+    renewed: int = 0
+    """Silent lines that were closed and opened anew."""
     busy_time: float = 0.0
     """Time in which an exchange was under way, s."""
     _marks: deque[tuple[float, float]] = field(default_factory=deque)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from custom_components.evse_bus.evse import bus
+from custom_components.evse_bus.evse import recovery
 from custom_components.evse_bus.evse.abl.config import Pauses
 from custom_components.evse_bus.evse.abl.reader import AblReader
 
@@ -10,7 +10,7 @@ from custom_components.evse_bus.evse.abl.reader import AblReader
 @pytest.fixture(autouse=True)
 def short_reopening(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reopen a lost port sooner."""
-    monkeypatch.setattr(bus, "REOPEN_FIRST", 0.1)
+    monkeypatch.setattr(recovery, "PAUSES", (0.1,))
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from custom_components.evse_bus.evse import bus as bus_module
+from custom_components.evse_bus.evse import recovery
 from custom_components.evse_bus.evse.ews.box import MOST_KEYS
 from custom_components.evse_bus.evse.ews.network import listener as listening
 from custom_components.evse_bus.evse.ews.network.line import AcceptedLine
@@ -155,7 +155,7 @@ def test_who_comes_and_goes_does_not_fill_the_log(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """With the number of a box that is away anybody is taken for it."""
-    monkeypatch.setattr(bus_module, "REOPEN_FIRST", 0.01)
+    monkeypatch.setattr(recovery, "PAUSES", (0.01,))
     monkeypatch.setattr(listening, "PROOF_PAUSE", 0.0)
     cycles = LOSSES + 10
 
