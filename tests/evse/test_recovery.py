@@ -9,8 +9,9 @@ import pytest
 
 from custom_components.evse_bus.evse.errors import LineLostError, PortMissingError
 from custom_components.evse_bus.evse.recovery import PAUSES, SILENCES, LineRecovery
+from tests.simulated_time import now, simulate
 
-from .simulated import Device, Scene, SimulatedLine, now, simulate
+from .simulated import Device, Scene, SimulatedLine
 from .test_master import PERIOD, BeatScene
 
 
