@@ -22,17 +22,6 @@ WRITE = 0x10
 
 PATIENCE = 10.0
 FOREVER = 1e6
-# Shorter time-outs, for all tests that do not measure real ones.
-QUICK = replace(
-    PROTOCOL,
-    timing=replace(
-        PROTOCOL.timing,
-        reply_timeout=0.12,
-        retry_pauses=(0.05, 0.05),
-        backoff=0.1,
-        backoff_limit=0.2,
-    ),
-)
 
 
 def config(
@@ -74,17 +63,15 @@ async def until(holds: Callable[[], object], patience: float = PATIENCE) -> None
 class Scene:
     """The two ends of a bus, as a context."""
 
-    def __init__(self, *boxes: AblBox, tcp: bool = False, quick: bool = True) -> None:
+    def __init__(self, *boxes: AblBox, tcp: bool = False) -> None:
         make = VirtualBus.tcp if tcp else VirtualBus.in_loop
-        # The wire is faster too.
-        self.virtual = make(*boxes, baud=384_000 if quick else 38_400, parity="E")
-        self.protocol = QUICK if quick else PROTOCOL
+        self.virtual = make(*boxes, baud=38_400, parity="E")
         self.boxes = boxes
         self.bus: Bus
 
     async def __aenter__(self) -> Self:
         self.virtual.start()
-        self.bus = self.protocol.bus(self.virtual.url)
+        self.bus = PROTOCOL.bus(self.virtual.url)
         await self.bus.start()
         return self
 
@@ -99,9 +86,8 @@ class Scene:
 
     def add(self, settings: AblConfig, wanted: Orders) -> AblCharger:
         """Put a charger on the bus."""
-        charger = self.protocol.charger(settings, wanted)
+        charger = PROTOCOL.charger(settings, wanted)
         assert isinstance(charger, AblCharger)
-        charger.timing = self.protocol.timing  # type: ignore[misc] # of this one
         self.bus.add(charger)
         return charger
 

@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from custom_components.evse_bus.evse.abl import PROTOCOL, reader
+from custom_components.evse_bus.evse.abl import reader
 from custom_components.evse_bus.evse.errors import WrongChargerError
 from custom_components.evse_bus.evse.model import Capability, Fault, OrderChange, Status
 from tests.virtual import AblBox, Car, Request
@@ -19,10 +19,10 @@ def plugged(**settings: float) -> Car:
 
 
 @pytest.mark.usefixtures("socket_enabled")
-@pytest.mark.parametrize("tcp", [False, True], ids=["pty", "tcp"])
+@pytest.mark.parametrize("tcp", [False, True], ids=["in loop", "tcp"])
 async def test_a_car_charges(tcp: bool) -> None:  # noqa: FBT001
     box = AblBox(1, car=plugged(max_current=12, phases=2, ramp=0.1, reaction=0.0))
-    async with Scene(box, tcp=tcp, quick=False) as scene:
+    async with Scene(box, tcp=tcp) as scene:
         charger = await scene.settled(config(), orders(10))
         await until(
             lambda: (
@@ -85,18 +85,17 @@ async def test_nothing_is_written_to_a_box_within_its_orders() -> None:
 
 
 async def test_a_request_to_a_sleeping_box_is_repeated_in_time() -> None:
-    async with Scene(AblBox(1, sleep_after=5), quick=False) as scene:
+    async with Scene(AblBox(1, sleep_after=5)) as scene:
         charger = scene.add(config(), orders())
         await until(lambda: charger.available)
         first, second = [one.t for one in scene.requests()[:2]]
-        assert second - first >= 0.5
-        assert PROTOCOL.timing.reply_timeout + PROTOCOL.timing.retry_pauses[0] <= 1.0
+        assert 0.5 <= second - first <= 1.0
         assert charger.misses == 0
         assert charger.statistics.timeouts == 1
 
 
 async def test_a_command_wakes_a_sleeping_box() -> None:
-    async with Scene(AblBox(1, sleep_after=1.5), quick=False) as scene:
+    async with Scene(AblBox(1, sleep_after=1.5)) as scene:
         charger = scene.add(config(poll_interval=60), orders())
         await until(lambda: charger.available and scene.boxes[0].asleep)
         await charger.change_orders(OrderChange(current=8))
@@ -222,7 +221,7 @@ async def test_a_box_replaced_between_two_replies() -> None:
 async def test_a_second_box_with_the_same_id_is_noticed() -> None:
     async with Scene(AblBox(1, jitter=0.0)) as scene:
         charger = await scene.settled(config(), orders())
-        # A little after the first: on this fast wire a reply takes 0.9 ms.
+        # It replies a little after the first.
         scene.virtual.add(
             AblBox(1, serial="2W22xy99999999", turn_round=0.0023, jitter=0.0)
         )

@@ -14,8 +14,6 @@ from .scene import LIMIT, STATE, Scene, box_with, config, orders, sleepy, until
 RESET, A1, E0 = 0x5A5A, 0xA1A1, 0xE0E0
 PAUSE = 1000
 
-pytestmark = pytest.mark.usefixtures("short_pauses")
-
 
 async def cut_off_wake(scene: Scene, box: AblBox) -> AblCharger:
     """Lose the port while a car is woken: the outlet is still disabled."""

@@ -239,7 +239,7 @@ async def test_a_box_that_refuses() -> None:
 
 async def test_after_lost_and_late_replies_a_pause_is_repeated() -> None:
     box = AblBox(1)
-    async with Scene(box, quick=False) as scene:
+    async with Scene(box) as scene:
         charger = await scene.settled(config(), orders())
         await scene.stop_polls(charger)
         foreign = scene.bus.wire.statistics.foreign_frames

@@ -24,7 +24,7 @@ def few_ids(monkeypatch: pytest.MonkeyPatch) -> None:
 
 async def scan(scene: Scene, progress: list[float] | None = None) -> ScanResult:
     shares = [] if progress is None else progress
-    return await scene.protocol.scan(scene.bus, config(), orders(), shares.append)
+    return await PROTOCOL.scan(scene.bus, config(), orders(), shares.append)
 
 
 def box(address: int, **settings: object) -> AblBox:
@@ -55,8 +55,7 @@ async def test_boxes_awake_asleep_and_dead() -> None:
         assert progress[-1] == 1.0
         # The sleeping box lost one request; the repeat came in time.
         first, second = [one.t for one in scene.reads(9, 0x01)]
-        assert second - first >= 0.5
-        assert PROTOCOL.timing.reply_timeout + scanning.REPEAT_PAUSE <= 1.0
+        assert 0.5 <= second - first <= 1.0
         assert {len(scene.reads(address, 0x01)) for address in (2, 4, 15)} == {2}
         # No other address is ever used.
         assert {one.device_id for one in scene.requests()} == set(range(1, 17))
@@ -70,7 +69,7 @@ async def test_an_empty_bus_takes_two_time_outs_for_each_id() -> None:
 
 
 @pytest.mark.usefixtures("few_ids")
-@pytest.mark.parametrize("later", [0.0003, 0.02], ids=["at once", "one by one"])
+@pytest.mark.parametrize("later", [0.003, 0.2], ids=["at once", "one by one"])
 async def test_two_boxes_with_one_id(later: float) -> None:
     boxes = (
         AblBox(1, serial="2W22xy00000001", jitter=0.0, turn_round=0.002),
@@ -129,7 +128,8 @@ async def test_other_chargers_are_polled_meanwhile() -> None:
         before = len(scene.reads(1, READING))
         result = await scan(scene)
         assert [one.address for one in result.found] == [1, 2]
-        assert len(scene.reads(1, READING)) - before > 10
+        # At least once between any two requests to the three silent IDs.
+        assert len(scene.reads(1, READING)) - before >= 3 * 2
         assert charger.available
         assert charger.statistics.timeouts == 0
 

@@ -30,8 +30,6 @@ from .scene import (
 RESET, A1, E0, E2 = 0x5A5A, 0xA1A1, 0xE0E0, 0xE2E2
 PAUSE = 1000
 
-pytestmark = pytest.mark.usefixtures("short_pauses")
-
 
 async def test_a_new_device_id() -> None:
     box = box_with()
