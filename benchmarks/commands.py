@@ -9,7 +9,7 @@ from typing import Final
 from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.charger import Charger
 from custom_components.evse_bus.evse.errors import EvseError
-from custom_components.evse_bus.evse.model import OrderChange, Supply
+from custom_components.evse_bus.evse.model import Circuit, OrderChange
 
 from .balancing import Shared
 
@@ -65,7 +65,7 @@ class House:
 
     async def share(self, amps: float) -> None:
         """Let the chargers share so much."""
-        duty = self.bus.master
-        if duty is not None:
+        master = self.bus.master
+        if master is not None:
             self.shared.append(Shared(asyncio.get_running_loop().time(), amps))
-            await duty.change_supply(Supply(limit=amps))
+            await master.change_circuit(Circuit(limit=amps))

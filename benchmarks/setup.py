@@ -11,9 +11,9 @@ from custom_components.evse_bus.evse.evbox import PROTOCOL as EVBOX, EvboxConfig
 from custom_components.evse_bus.evse.ews import PROTOCOL as EWS, EwsPortConfig
 from custom_components.evse_bus.evse.framing import LineSettings
 from custom_components.evse_bus.evse.model import (
+    Circuit,
     CurrentLimit,
     Orders,
-    Supply,
 )
 from custom_components.evse_bus.evse.smartevse import (
     MASTER,
@@ -109,7 +109,7 @@ def smartevse_bus(url: str, unit: int) -> Bus:
 
 def master_bus(url: str, units: Iterable[int], supply: float) -> Bus:
     """Return a bus with slaves on it that share a supply, A."""
-    bus = MASTER.bus(url, supply=Supply(limit=supply))
+    bus = MASTER.bus(url, circuit=Circuit(limit=supply))
     for unit in units:
         config = SlaveConfig(
             key=f"smartevse-{unit}",

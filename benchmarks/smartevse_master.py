@@ -8,7 +8,7 @@ from statistics import fmean
 from typing import Final
 
 from custom_components.evse_bus.evse.bus import Bus
-from custom_components.evse_bus.evse.model import OrderChange, Supply
+from custom_components.evse_bus.evse.model import Circuit, OrderChange
 from custom_components.evse_bus.evse.smartevse.master import SLACK
 
 from .balancing import (
@@ -246,7 +246,7 @@ async def _shares(bus: Bus, times: int) -> tuple[list[Called], list[Called]]:
     for charger in (one, other):
         await charger.change_orders(OrderChange(current=HIGH))
     if bus.master is not None:
-        await bus.master.change_supply(Supply(limit=HIGH + LOW))
+        await bus.master.change_circuit(Circuit(limit=HIGH + LOW))
     await asyncio.sleep(FOLLOWED)
     freed: list[Called] = []
     given_back: list[Called] = []

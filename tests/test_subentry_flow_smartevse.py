@@ -321,7 +321,7 @@ async def test_shared_supply_is_changed_while_the_slaves_hear_their_master(
             "supply_minimum": 8,
         }
         assert entry.state is ConfigEntryState.LOADED
-        supply = entry.runtime_data.bus.master.supply
+        supply = entry.runtime_data.bus.master.circuit
         assert (supply.limit, supply.minimum) == (9, 8)
         assert bus.opened == 1
         await take_down(hass, entry)

@@ -10,7 +10,7 @@ from hypothesis import given, strategies as st
 import pytest
 
 from custom_components.evse_bus.evse.errors import RefusedOrderError
-from custom_components.evse_bus.evse.model import CurrentLimit, Orders, Supply
+from custom_components.evse_bus.evse.model import Circuit, CurrentLimit, Orders
 from custom_components.evse_bus.orders import (
     OrderStore,
     SupplyOrder,
@@ -20,7 +20,7 @@ from custom_components.evse_bus.orders import (
 from custom_components.evse_bus.supply import SharedSupply
 
 STORE = "evse_bus.bus"
-INSTALLED = Supply(limit=25.0, minimum=8.0)
+INSTALLED = Circuit(limit=25.0, minimum=8.0)
 
 amounts = st.none() | st.floats(0, 240)
 
@@ -35,12 +35,12 @@ def stored(supply: object, **chargers: Orders) -> dict[str, Any]:
 class Sharing:
     """A supply that tells a list instead of a master."""
 
-    def __init__(self, hass: HomeAssistant, installed: Supply = INSTALLED) -> None:
+    def __init__(self, hass: HomeAssistant, installed: Circuit = INSTALLED) -> None:
         self.told: list[float] = []
         self.orders = OrderStore(hass, "bus")
         self.supply = SharedSupply(installed, self.orders, self.follow)
 
-    async def follow(self, supply: Supply) -> None:
+    async def follow(self, supply: Circuit) -> None:
         self.told.append(supply.limit)
 
     async def begin(self, *, new: bool = False) -> bool:
@@ -69,7 +69,7 @@ async def test_a_new_bus_shares_all_there_is(
     assert sharing.told == [25.0]
     # Nobody has said anything yet: what the installation gives may still change.
     assert hass_storage[STORE]["data"] == {"bus": {"supply": None}}
-    await sharing.supply.async_update_installed(Supply(limit=32.0))
+    await sharing.supply.async_update_installed(Circuit(limit=32.0))
     assert sharing.supply.limit == 32.0
 
 
@@ -105,9 +105,9 @@ async def test_it_never_exceeds_what_the_installation_gives(
     hass_storage[STORE] = stored(40.0)
     sharing = Sharing(hass)
     await sharing.begin()
-    await sharing.supply.async_update_installed(Supply(limit=16.0))
-    await sharing.supply.async_update_installed(Supply(limit=16.0))
-    await sharing.supply.async_update_installed(Supply(limit=32.0))
+    await sharing.supply.async_update_installed(Circuit(limit=16.0))
+    await sharing.supply.async_update_installed(Circuit(limit=16.0))
+    await sharing.supply.async_update_installed(Circuit(limit=32.0))
     assert sharing.told == [25.0, 16.0, 32.0]
     for absurd in (32.1, -1, nan, inf):
         with pytest.raises(RefusedOrderError):

@@ -152,7 +152,7 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
                 if self.protocol.probe_sets_limits:
                     return await self.async_step_impose()
                 self._searches = [read_only_probe(self.protocol)]
-                if self.protocol.supply is not None:
+                if self.protocol.circuit is not None:
                     return await self.async_step_supply()
                 return await self.async_step_scan()
         usual = self.protocol.settings

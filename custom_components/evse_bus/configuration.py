@@ -28,9 +28,9 @@ from .evse.framing import LineSettings
 from .evse.model import (
     MINIMUM_CURRENT,
     ChargerConfig,
+    Circuit,
     CurrentLimit,
     Orders,
-    Supply,
 )
 from .evse.protocols import PROTOCOLS
 
@@ -76,11 +76,11 @@ def rebuild_data(data: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in data.items() if key not in _LIVE_KEYS}
 
 
-def supply_of(data: Mapping[str, Any]) -> Supply | None:
+def supply_of(data: Mapping[str, Any]) -> Circuit | None:
     """Return the supply that the chargers share; ``None``: they share none."""
-    if protocol_of(data).supply is None:
+    if protocol_of(data).circuit is None:
         return None
-    return Supply(
+    return Circuit(
         limit=float(data.get(CONF_SUPPLY_LIMIT, MINIMUM_CURRENT)),
         minimum=float(data.get(CONF_SUPPLY_MINIMUM, MINIMUM_CURRENT)),
     )

@@ -72,7 +72,7 @@ class PortConnection(Connections):
             self.name,
             settings=line_settings(entry.data),
             name=entry.title,
-            supply=supply_of(entry.data),
+            circuit=supply_of(entry.data),
         )
 
     @property

@@ -32,7 +32,7 @@ from .discovery import async_set_up_now, async_wants_to_connect
 from .evse.bus import Bus
 from .evse.ews import EwsPort
 from .evse.listeners import notify
-from .evse.model import ChargerConfig, Orders, Supply
+from .evse.model import ChargerConfig, Circuit, Orders
 from .issues import BusIssues
 from .managed_charger import ManagedCharger, async_shut_down_chargers
 from .orders import OrderStore, async_run_uncancelled
@@ -144,10 +144,10 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
             await async_run_uncancelled(self.hass, order, "evse_bus shared supply")
             self.issues.supply_renewed()
 
-    async def _async_apply_supply(self, supply: Supply) -> None:
+    async def _async_apply_supply(self, circuit: Circuit) -> None:
         self._notify(BUS)
         if self.connections.master is not None:
-            await self.connections.master.change_supply(supply)
+            await self.connections.master.change_circuit(circuit)
 
     @callback
     def _on_master(self) -> None:

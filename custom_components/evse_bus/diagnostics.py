@@ -119,7 +119,7 @@ def _master(coordinator: BusCoordinator) -> dict[str, Any] | None:
         "statistics": plain(master.statistics),
     }
     if isinstance(master, Master):
-        data["supply"] = plain(master.supply)
+        data["supply"] = plain(master.circuit)
         # In tenths of an ampere, by Modbus address.
         data["shares"] = {
             str(address): share / 10 for address, share in master.shares().items()

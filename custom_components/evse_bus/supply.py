@@ -9,7 +9,7 @@ from collections.abc import Awaitable, Callable
 from typing import Final
 
 from .evse.errors import RefusedOrderError
-from .evse.model import Supply
+from .evse.model import Circuit
 from .evse.safety import number, round_down
 from .orders import OrderStore, SupplyOrder
 
@@ -22,9 +22,9 @@ class SharedSupply:
 
     def __init__(
         self,
-        installed: Supply,
+        installed: Circuit,
         orders: OrderStore,
-        apply: Callable[[Supply], Awaitable[None]],
+        apply: Callable[[Circuit], Awaitable[None]],
     ) -> None:
         """Read and apply nothing yet.
 
@@ -70,11 +70,11 @@ class SharedSupply:
         # Reads the limit again: a newer order may have been stored in the meantime.
         await self._async_apply()
 
-    async def async_update_installed(self, installed: Supply) -> None:
+    async def async_update_installed(self, installed: Circuit) -> None:
         """Apply a changed limit of the installation."""
         if installed != self.installed:
             self.installed = installed
             await self._async_apply()
 
     async def _async_apply(self) -> None:
-        await self._apply(Supply(limit=self.limit, minimum=self.installed.minimum))
+        await self._apply(Circuit(limit=self.limit, minimum=self.installed.minimum))

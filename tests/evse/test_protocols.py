@@ -44,7 +44,7 @@ def test_live_fields_are_fields_of_the_configuration(protocol: Protocol) -> None
 
 @each_protocol
 def test_a_supply_needs_a_master(protocol: Protocol) -> None:
-    assert (protocol.supply is None) == (protocol.master is None)
+    assert (protocol.circuit is None) == (protocol.master is None)
 
 
 def test_protocols_of_a_make_are_chosen_from_a_menu() -> None:

@@ -11,7 +11,7 @@ from .charger import Charger, Scheduler
 from .exchange import Turn
 from .framing import Frame
 from .listeners import Observable
-from .model import Fault, Supply
+from .model import Circuit, Fault
 from .schedule import Kind, Slot
 from .statistics import ChargerStatistics
 
@@ -69,10 +69,10 @@ class BusMaster(ChargerGroup, Observable, ABC):
         """Look at an unsolicited frame; return whether it was for the master."""
         return False
 
-    async def change_supply(self, supply: Supply) -> None:
-        """Share this supply from now on; return when all chargers were informed.
+    async def change_circuit(self, circuit: Circuit) -> None:
+        """Keep to this circuit limit from now on; return when it has been sent.
 
-        Raises RefusedOrderError for an impossible supply.
+        Raises RefusedOrderError for values out of range.
         """
 
     def notice(self, fault: Fault, *, present: bool) -> None:

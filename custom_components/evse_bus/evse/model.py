@@ -382,8 +382,8 @@ class ChargerConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Supply:
-    """What all chargers of a bus share, where the bus has a master."""
+class Circuit:
+    """The circuit that all chargers of a bus share, where the bus has a master."""
 
     limit: float = MINIMUM_CURRENT
     """A for each phase, all chargers together."""

@@ -15,7 +15,7 @@ from .charger import Charger
 from .framing import Frame, Framer, LineSettings, Timing
 from .line import Line
 from .master import BusMaster, ChargerGroup
-from .model import ChargerConfig, Orders, Supply
+from .model import ChargerConfig, Circuit, Orders
 from .options import Option
 from .redaction import SerialNumbers
 from .scan import ScanResult
@@ -39,8 +39,8 @@ class Make:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SupplyRange:
-    """Range of what the chargers of a bus share."""
+class CircuitRange:
+    """Range of the values of a `Circuit`."""
 
     highest: float
     """Highest limit of all chargers together, A per phase."""
@@ -86,7 +86,7 @@ class Protocol[C: ChargerConfig = Any]:
     number); 1: a box is one charger."""
     dials_in: bool = False
     """The boxes dial us: there is a listener and no port, and a bus for each box."""
-    master: Callable[[Supply], BusMaster] | None = None
+    master: Callable[[Circuit], BusMaster] | None = None
     """Makes the master of the bus, where Home Assistant is that."""
     group: Callable[[], ChargerGroup] | None = None
     """Makes the owner of what the chargers of one bus share, where they are one box."""
@@ -95,7 +95,7 @@ class Protocol[C: ChargerConfig = Any]:
 
     address: AddressForm
     options: tuple[Option, ...] = ()
-    supply: SupplyRange | None = None
+    circuit: CircuitRange | None = None
     """Of the shared supply; ``None``: the chargers share none. Needs a `master`."""
     asks_voltage: bool = True
     """The chargers report no power; it is estimated from the configured voltage."""
@@ -128,11 +128,11 @@ class Protocol[C: ChargerConfig = Any]:
         *,
         settings: LineSettings | None = None,
         name: str = "",
-        supply: Supply | None = None,
+        circuit: Circuit | None = None,
     ) -> Bus:
         """Return a bus of this protocol on a port; `Bus.start` opens it.
 
-        ``supply`` is shared by its chargers, where the bus has a master. Raises
+        ``circuit`` is shared by its chargers, where the bus has a master. Raises
         TypeError where boxes dial us: then the listener makes the buses.
         """
         if self.dials_in:
@@ -141,7 +141,7 @@ class Protocol[C: ChargerConfig = Any]:
         line = Line(url, settings or self.settings)
         group: ChargerGroup | None = None
         if self.master is not None:
-            group = self.master(supply or Supply())
+            group = self.master(circuit or Circuit())
         elif self.group is not None:
             group = self.group()
         return Bus(line, self.framer(), self.timing, name, group=group)

@@ -19,7 +19,7 @@ SUGGESTED_SUPPLY: Final = 16.0
 
 def supply_form(protocol: Protocol) -> vol.Schema:
     """Return the form for the shared supply; empty where chargers share none."""
-    supply = protocol.supply
+    supply = protocol.circuit
     if supply is None:
         return vol.Schema({})
     return vol.Schema(

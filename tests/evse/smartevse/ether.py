@@ -16,7 +16,7 @@ from custom_components.evse_bus.evse.errors import LineLostError
 from custom_components.evse_bus.evse.framing import LineSettings
 from custom_components.evse_bus.evse.line import Line
 from custom_components.evse_bus.evse.modbus import RtuFramer
-from custom_components.evse_bus.evse.model import CurrentLimit, Orders, Supply
+from custom_components.evse_bus.evse.model import Circuit, CurrentLimit, Orders
 from custom_components.evse_bus.evse.smartevse.config import SlaveConfig
 from custom_components.evse_bus.evse.smartevse.master import Master
 from custom_components.evse_bus.evse.smartevse.reader import TIMING
@@ -204,7 +204,7 @@ class MasterScene:
 
     def new_bus(self) -> None:
         """Home Assistant starts anew; the boxes have lived on."""
-        self.master = Master(Supply(limit=self.limit, minimum=self.minimum))
+        self.master = Master(Circuit(limit=self.limit, minimum=self.minimum))
         self.bus = Bus(self.line, RtuFramer(), TIMING, "simulated", group=self.master)
 
     def plug_box(self, unit: int, dialect: str = "2.17") -> Box:
@@ -280,7 +280,7 @@ class MasterScene:
         if sent.is_broadcast:
             # A box that nobody can reach is told 6 A, whatever there is.
             lowest = 60 * sum(word > 0 for word in sent.words)
-            limit = max(self.master.supply.limit * 10, lowest)
+            limit = max(self.master.circuit.limit * 10, lowest)
             self.said = max(self.said, sum(sent.words) - limit)
 
     async def _live(self) -> None:
@@ -288,7 +288,7 @@ class MasterScene:
             self.line.live()
             offers = self.offers
             self.most = max(self.most, offers)
-            over = offers - self.master.supply.limit
+            over = offers - self.master.circuit.limit
             self.overshoot = max(self.overshoot, over)
             await asyncio.sleep(STEP)
 

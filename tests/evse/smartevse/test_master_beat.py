@@ -7,7 +7,7 @@ from random import Random
 import pytest
 
 from custom_components.evse_bus.evse.errors import EvseError, LineLostError
-from custom_components.evse_bus.evse.model import OrderChange, Setting, Supply
+from custom_components.evse_bus.evse.model import Circuit, OrderChange, Setting
 from custom_components.evse_bus.evse.smartevse.master import (
     LISTENING,
     PERIOD,
@@ -71,7 +71,7 @@ class Trouble:
             self.make_noise,
             self.foreign,
             self.remove_or_add,
-            self.change_supply,
+            self.change_circuit,
             self.nothing,
         )
 
@@ -114,9 +114,9 @@ class Trouble:
         elif self.dice.random() < 0.3:
             await self.scene.bus.remove(gone)
 
-    async def change_supply(self) -> None:
-        supply = Supply(limit=self.dice.choice((20.0, 32.0)))
-        await self.scene.master.change_supply(supply)
+    async def change_circuit(self) -> None:
+        supply = Circuit(limit=self.dice.choice((20.0, 32.0)))
+        await self.scene.master.change_circuit(supply)
 
     async def nothing(self) -> None:
         """Let it all go on."""

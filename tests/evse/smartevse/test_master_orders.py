@@ -6,11 +6,11 @@ import pytest
 
 from custom_components.evse_bus.evse.errors import NotConfirmedError
 from custom_components.evse_bus.evse.model import (
+    Circuit,
     Fault,
     OrderChange,
     Setting,
     Status,
-    Supply,
 )
 from custom_components.evse_bus.evse.smartevse.slave import WITHHELD_FOR
 from tests.evse.smartevse.ether import MasterScene
@@ -106,7 +106,7 @@ def test_a_box_that_stays_above_its_share_is_told_of() -> None:
             await asyncio.sleep(3)
             scene.box(2).misses = lambda data: data.startswith(b"\x00\x10")
             begin = now()
-            await scene.master.change_supply(Supply(limit=10.0))
+            await scene.master.change_circuit(Circuit(limit=10.0))
             await asyncio.sleep(5)
             assert Fault.LIMIT_NOT_TAKEN in scene.slave(2).faults
             # Said again with each reading that shows it, beside the regular ones.
@@ -231,7 +231,7 @@ def test_the_last_come_is_stopped_where_the_supply_does_not_suffice() -> None:
             await scene.charge(4)
             await asyncio.sleep(3)
             assert scene.offers == 18
-            await scene.master.change_supply(Supply(limit=13.0))
+            await scene.master.change_circuit(Circuit(limit=13.0))
             lowered = now()
             await asyncio.sleep(0.6)
             assert scene.box(4).state == "A"
@@ -246,17 +246,17 @@ def test_the_last_come_is_stopped_where_the_supply_does_not_suffice() -> None:
             assert waiting.reading is not None
             assert waiting.reading.connectors[1].status is Status.SUSPENDED_EVSE
             # Room at once, but it does not flap.
-            await scene.master.change_supply(Supply(limit=18.0))
+            await scene.master.change_circuit(Circuit(limit=18.0))
             back = await scene.until(lambda: scene.box(4).state == "C", 100)
             assert now() - lowered >= WITHHELD_FOR
             assert back < WITHHELD_FOR + 10
             assert scene.offers == 18
             # The user's word is not ours to give back.
-            await scene.master.change_supply(Supply(limit=13.0))
+            await scene.master.change_circuit(Circuit(limit=13.0))
             await asyncio.sleep(2)
             scene.overshoot = 0.0
             await scene.slave(4).change_orders(OrderChange(allowed=False))
-            await scene.master.change_supply(Supply(limit=32.0))
+            await scene.master.change_circuit(Circuit(limit=32.0))
             await asyncio.sleep(100)
             assert scene.box(4).offers == 0
             assert scene.offers == 32

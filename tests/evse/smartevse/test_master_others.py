@@ -6,7 +6,7 @@ import pytest
 
 from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.errors import NotAvailableError, RefusedOrderError
-from custom_components.evse_bus.evse.model import Fault, OrderChange, Supply
+from custom_components.evse_bus.evse.model import Circuit, Fault, OrderChange
 from custom_components.evse_bus.evse.scan import ScanResult
 from custom_components.evse_bus.evse.smartevse import MASTER
 from custom_components.evse_bus.evse.smartevse.master import STAY_SILENT, Master
@@ -202,14 +202,14 @@ def test_a_scan_of_a_running_bus_holds_no_broadcast_up() -> None:
 @pytest.mark.parametrize(
     "supply",
     [
-        Supply(limit=float("nan")),
-        Supply(limit=-1.0),
-        Supply(minimum=5.0),
-        Supply(minimum=81.0),
-        Supply(limit=16, minimum=float("inf")),
+        Circuit(limit=float("nan")),
+        Circuit(limit=-1.0),
+        Circuit(minimum=5.0),
+        Circuit(minimum=81.0),
+        Circuit(limit=16, minimum=float("inf")),
     ],
 )
-def test_a_supply_that_cannot_be_is_refused(supply: Supply) -> None:
+def test_a_supply_that_cannot_be_is_refused(supply: Circuit) -> None:
     with pytest.raises(RefusedOrderError):
         Master(supply)
 

@@ -8,10 +8,10 @@ import pytest
 
 from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.model import (
+    Circuit,
     CurrentLimit,
     OrderChange,
     Orders,
-    Supply,
 )
 from custom_components.evse_bus.evse.scan import ScanResult
 from custom_components.evse_bus.evse.smartevse import MASTER, SlaveConfig, master
@@ -83,7 +83,7 @@ async def test_two_cars_share_16_a() -> None:
     boxes = make_box(2), make_box(3)
     witness = Witness(*boxes)
     async with VirtualBus.pty(*boxes, witness) as virtual:
-        bus = MASTER.bus(virtual.url, supply=Supply(limit=16.0))
+        bus = MASTER.bus(virtual.url, circuit=Circuit(limit=16.0))
         put_on(bus, 2, 3)
         async with bus:
             for charger in bus.chargers.values():
@@ -123,7 +123,7 @@ async def test_killed_without_a_goodbye_the_slaves_stop_by_themselves() -> None:
     box = make_box(2)
     witness = Witness(box)
     async with VirtualBus.pty(box, witness) as virtual:
-        bus = MASTER.bus(virtual.url, supply=Supply(limit=16.0))
+        bus = MASTER.bus(virtual.url, circuit=Circuit(limit=16.0))
         put_on(bus, 2)
         await bus.start()
         await bus.chargers["2"].wait_available()
@@ -149,7 +149,7 @@ async def test_stopped_and_started_again_who_charges_goes_on() -> None:
     box = make_box(2)
     witness = Witness(box)
     async with VirtualBus.pty(box, witness) as virtual:
-        bus = MASTER.bus(virtual.url, supply=Supply(limit=16.0))
+        bus = MASTER.bus(virtual.url, circuit=Circuit(limit=16.0))
         put_on(bus, 2)
         async with bus:
             await bus.chargers["2"].wait_available()
@@ -158,7 +158,7 @@ async def test_stopped_and_started_again_who_charges_goes_on() -> None:
                 lambda: box.contactor and box.pilot_current == 16, timeout=PATIENCE
             )
         heard = len(box.broadcasts)
-        bus = MASTER.bus(virtual.url, supply=Supply(limit=16.0))
+        bus = MASTER.bus(virtual.url, circuit=Circuit(limit=16.0))
         put_on(bus, 2)
         async with bus:
             await virtual.wait_for_async(
@@ -175,7 +175,7 @@ async def test_the_scan_finds_slaves_and_says_nothing_else() -> None:
     boxes = make_box(2), make_box(4)
     async with (
         VirtualBus.pty(*boxes) as virtual,
-        MASTER.bus(virtual.url, supply=Supply()) as bus,
+        MASTER.bus(virtual.url, circuit=Circuit()) as bus,
     ):
         report: ScanResult = await MASTER.scan(
             bus, config(2), Orders(limit=CurrentLimit(current=6.0)), lambda _share: None
@@ -188,7 +188,7 @@ async def test_the_scan_finds_slaves_and_says_nothing_else() -> None:
 async def test_a_box_that_is_master_itself_silences_us() -> None:
     boxes = SmartEvse("2.17", load_balance=1), make_box(2)
     async with VirtualBus.pty(*boxes) as virtual:
-        bus = MASTER.bus(virtual.url, supply=Supply(limit=16.0))
+        bus = MASTER.bus(virtual.url, circuit=Circuit(limit=16.0))
         put_on(bus, 2)
         async with bus:
             assert bus.master is not None

@@ -7,9 +7,9 @@ import pytest
 
 from custom_components.evse_bus.evse.errors import EvseError
 from custom_components.evse_bus.evse.model import (
+    Circuit,
     Fault,
     OrderChange,
-    Supply,
 )
 from tests.evse.smartevse.ether import MasterScene
 from tests.evse.smartevse.test_master_requests import ASKS, answers
@@ -29,11 +29,11 @@ def test_who_does_not_hear_its_stop_is_granted_current_again_later() -> None:
             await asyncio.sleep(3)
             box = scene.box(2)
             box.misses = lambda data: data[1:4] == ACCESS
-            await scene.master.change_supply(Supply(limit=5.0))
+            await scene.master.change_circuit(Circuit(limit=5.0))
             await asyncio.sleep(3)
             box.car.leave()
             await asyncio.sleep(5)
-            await scene.master.change_supply(Supply(limit=16.0))
+            await scene.master.change_circuit(Circuit(limit=16.0))
             await scene.until(lambda: not scene.slave(2).withheld)
             await asyncio.sleep(3)
             assert box.controller.outlet.access
@@ -96,9 +96,9 @@ def test_a_no_at_the_box_right_before_our_own_stop_stays(want: str) -> None:
             await scene.until(lambda: scene.slave(2).slot.ready - now() > 1.9)
             scene.box(2).controller.outlet.set_access(False)
             if want == "supply":
-                await scene.master.change_supply(Supply(limit=5.0))
+                await scene.master.change_circuit(Circuit(limit=5.0))
                 await asyncio.sleep(3)
-                await scene.master.change_supply(Supply(limit=16.0))
+                await scene.master.change_circuit(Circuit(limit=16.0))
             else:
                 await scene.slave(2).change_orders(OrderChange(current=0.0))
                 await scene.slave(2).change_orders(OrderChange(current=16.0))
@@ -131,9 +131,9 @@ def test_nothing_is_granted_to_a_box_that_was_stopped_for_want_of_supply() -> No
             await asyncio.sleep(5)
             await scene.charge(2)
             await asyncio.sleep(3)
-            await scene.master.change_supply(Supply(limit=5.0))
+            await scene.master.change_circuit(Circuit(limit=5.0))
             await asyncio.sleep(3)
-            await scene.master.change_supply(Supply(limit=16.0))
+            await scene.master.change_circuit(Circuit(limit=16.0))
             asked = now()
             scene.box(2).controller.outlet.set_access(True)
             scene.line.say(ASKS)
@@ -154,7 +154,7 @@ def test_after_a_restart_nothing_is_given_back() -> None:
             await asyncio.sleep(5)
             await scene.charge(2)
             await asyncio.sleep(3)
-            await scene.master.change_supply(Supply(limit=5.0))
+            await scene.master.change_circuit(Circuit(limit=5.0))
             await asyncio.sleep(3)
             await scene.bus.stop()
             scene.new_bus()
@@ -178,7 +178,7 @@ def test_a_box_that_does_not_stop_is_told_of() -> None:
             await asyncio.sleep(3)
             assert Fault.LIMIT_NOT_TAKEN not in scene.slave(2).faults
             scene.box(2).controller.ignore_access = True
-            await scene.master.change_supply(Supply(limit=5.0))
+            await scene.master.change_circuit(Circuit(limit=5.0))
             await asyncio.sleep(6)
             assert scene.offers == 6
             assert Fault.LIMIT_NOT_TAKEN in scene.slave(2).faults

@@ -134,8 +134,8 @@ def test_a_lower_supply_counts_at_once(first: float, then: float, at: float) -> 
             await asyncio.sleep(4)
             await scene.charge(2, 3)
             await asyncio.sleep(6 + at)
-            supply = scene.master.supply
-            await scene.master.change_supply(type(supply)(limit=then))
+            supply = scene.master.circuit
+            await scene.master.change_circuit(type(supply)(limit=then))
             # One broadcast, and a stop for each box that is too many.
             await asyncio.sleep(1.0)
             assert scene.offers <= then

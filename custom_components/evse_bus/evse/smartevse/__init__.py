@@ -8,7 +8,7 @@ from ..framing import LineSettings
 from ..modbus import RtuFramer
 from ..model import MAXIMUM_CURRENT
 from ..options import Toggle
-from ..protocol import Make, Protocol, SupplyRange
+from ..protocol import CircuitRange, Make, Protocol
 from ..redaction import SerialNumbers
 from .config import PolledConfig, SlaveConfig
 from .master import Master
@@ -71,7 +71,7 @@ MASTER: Final = Protocol(
         key="slave", lowest=2, highest=4, labelled=True, has_serial=False
     ),
     # Three boxes at most; the minimum as in the menu of a box (MIN).
-    supply=SupplyRange(highest=3 * MAXIMUM_CURRENT, highest_minimum=16),
+    circuit=CircuitRange(highest=3 * MAXIMUM_CURRENT, highest_minimum=16),
     serials=_SERIALS,
 )
 

@@ -1,8 +1,8 @@
 """The frames of SmartEVSE load balancing: broadcast, requests, acknowledgements.
 
 Pure functions. Source: README of v2, registers 0x00* and 0x008*, and PROTOCOLS.md, 3:
-a master broadcasts currents every 2 s; a slave that wants something writes to a
-register of its own address, each second until the master writes the answer there.
+a master broadcasts currents every 2 s; a slave with a request writes to a register of
+its own address, each second until the master writes the answer there.
 """
 
 from collections.abc import Sequence
@@ -23,22 +23,22 @@ from ..safety import Setpoint
 from .registers import tenths
 
 BROADCAST: Final = 0
-"""The unit that all boxes of the dialect 2.17 hear."""
+"""The unit at which all boxes of the dialect 2.17 listen."""
 SLAVES: Final = range(2, 5)
 CURRENTS: Final = 4
-"""Words of a broadcast, for units 1 to 4."""
+"""Values of a broadcast, for units 1 to 4."""
 _CURRENTS_REGISTER: Final = 0x0001
 _ACKNOWLEDGE: Final = 0x80
 """Added to the register of a request."""
 
-_MASTERS: Final = {(0, 0x0001), (9, 0x0001), (9, 0x0020), (0, 0x0020)}
+_BROADCASTS: Final = {(0, 0x0001), (9, 0x0001), (9, 0x0020), (0, 0x0020)}
 """Unit and register of a broadcast of currents, in any dialect."""
 _WRITE_HEAD: Final = 5
-"""Bytes of a request to write several registers, before what it writes."""
+"""Bytes of a request to write several registers, before the values."""
 
 
 class RequestKind(IntEnum):
-    """What a slave asks for; the value is the register it writes to."""
+    """The request of a slave; its value is the register that it writes."""
 
     A = 1
     """The car has left: to state A."""
@@ -60,20 +60,20 @@ class SlaveRequest:
     """A, of requests for B and C."""
 
 
-def broadcast(words: Sequence[Setpoint | None]) -> bytes:
-    """Return the frame that tells units 1 to 4 their currents; ``None``: 0 A.
+def broadcast(setpoints: Sequence[Setpoint | None]) -> bytes:
+    """Return the broadcast of currents for units 1 to 4; ``None``: 0 A.
 
     0 A is no stop: a charging slave then offers 6 A (PROTOCOLS.md, 3).
     """
-    if len(words) != CURRENTS:
-        message = f"a broadcast has {CURRENTS} currents, not {len(words)}"
+    if len(setpoints) != CURRENTS:
+        message = f"a broadcast has {CURRENTS} currents, not {len(setpoints)}"
         raise RefusedOrderError(message)
-    values = [0 if one is None else tenths(one) for one in words]
+    values = [0 if one is None else tenths(one) for one in setpoints]
     return rtu_frame(BROADCAST, write_registers(_CURRENTS_REGISTER, values))
 
 
 def acknowledge(request: SlaveRequest, setpoint: Setpoint | None) -> bytes:
-    """Return the answer to a request; ``None``: 0 A, there is no current for it."""
+    """Return the answer to a request; ``None``: 0 A, no current is granted."""
     if request.unit not in SLAVES:
         message = f"{request.unit} is no address of a slave (2 to 4)"
         raise RefusedOrderError(message)
@@ -82,7 +82,7 @@ def acknowledge(request: SlaveRequest, setpoint: Setpoint | None) -> bytes:
 
 
 def decode_request(frame: ModbusFrame) -> SlaveRequest | None:
-    """Return what a slave asks for with this frame; ``None``: it is no request."""
+    """Return the request of a slave in a frame; ``None``: it is no request."""
     if (
         frame.function != WRITE_SINGLE_REGISTER
         or frame.unit not in SLAVES
@@ -101,10 +101,10 @@ def decode_request(frame: ModbusFrame) -> SlaveRequest | None:
 def is_foreign_broadcast(frame: ModbusFrame) -> bool:
     """Return whether a frame is a master's broadcast of currents.
 
-    Our own is one too, where the adapter hears itself: the line takes that out.
+    That includes our own, received as an echo: the caller knows which it has sent.
     """
     return (
         frame.function == WRITE_MULTIPLE_REGISTERS
         and len(frame.data) > _WRITE_HEAD
-        and (frame.unit, int.from_bytes(frame.data[:2], "big")) in _MASTERS
+        and (frame.unit, int.from_bytes(frame.data[:2], "big")) in _BROADCASTS
     )

@@ -22,7 +22,7 @@ from ..exchange import Request, Turn
 from ..framing import Frame
 from ..master import BusMaster
 from ..modbus import ModbusFrame
-from ..model import Fault, Supply
+from ..model import Circuit, Fault
 from ..safety import Setpoint
 from .balancing import CURRENTS, broadcast, decode_request, is_foreign_broadcast
 from .registers import LONGEST_REQUEST, tenths
@@ -59,7 +59,7 @@ STILL_CHARGING: Final = 8.0
 RETRY: Final = 0.5
 """Pause after a turn that failed unexpectedly, s."""
 PATIENCE: Final = 3.0
-"""Longest wait for a broadcast that carries a new supply, s."""
+"""Longest wait for a broadcast after the circuit limit has changed, s."""
 
 _OTHER_MASTER: Final = (
     "another master speaks on this line; two masters would undo each other's limits"
@@ -132,12 +132,12 @@ class _Phase(Enum):
 class Master(BusMaster):
     """The broadcast, and the current that all slaves together may draw."""
 
-    def __init__(self, supply: Supply) -> None:
+    def __init__(self, circuit: Circuit) -> None:
         """Raise RefusedOrderError for values out of range."""
         super().__init__()
         # A late broadcast has no deadline to defend it: short as it is, it goes first.
         self.slot.due = -inf
-        self._supply = checked(supply)
+        self._circuit = checked(circuit)
         self._phase = _Phase.LISTENING
         self._planned = 0.0
         """Loop time of the next regular broadcast."""
@@ -159,13 +159,13 @@ class Master(BusMaster):
     # -- The circuit limit -------------------------------------------------------
 
     @property
-    def supply(self) -> Supply:
-        """Return the supply that the slaves share."""
-        return self._supply
+    def circuit(self) -> Circuit:
+        """Return the circuit that the slaves share."""
+        return self._circuit
 
     @override
-    async def change_supply(self, supply: Supply) -> None:
-        self._supply = checked(supply)
+    async def change_circuit(self, circuit: Circuit) -> None:
+        self._circuit = checked(circuit)
         self.updated()
         self._broadcast_sent.clear()
         self.update_shares()
@@ -183,12 +183,12 @@ class Master(BusMaster):
     @property
     def _limit(self) -> int:
         """Return the circuit limit, 0.1 A."""
-        return round(self._supply.limit * 10)
+        return round(self._circuit.limit * 10)
 
     @property
     def _minimum(self) -> int:
         """Return the least share of a slave that charges, 0.1 A."""
-        return round(self._supply.minimum * 10)
+        return round(self._circuit.minimum * 10)
 
     # -- The slaves --------------------------------------------------------------
 

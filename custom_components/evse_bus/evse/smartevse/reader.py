@@ -67,7 +67,7 @@ READS: Final = 3
 WRITES: Final = 2
 """Attempts to write a value, each followed by its read-back."""
 FAILURES: Final = 3
-"""Implausible or missing replies in a row that make the firmware a doubtful one."""
+"""Implausible or missing replies in a row before a fault is set."""
 CONFIGURATION_INTERVAL: Final = 300.0
 """Time between two readings of a box's settings, s."""
 CONFIGURATION_RETRY: Final = 30.0

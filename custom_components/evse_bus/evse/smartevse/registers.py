@@ -66,8 +66,7 @@ def decode_configuration(
 ) -> Configuration:
     """Return the contents of all blocks of a dialect's configuration.
 
-    Raises ImplausibleReplyError if one value is missing or not possible: then none of
-    them is accepted.
+    Raises ImplausibleReplyError if any value is missing or impossible.
     """
     layout = MAPS[dialect]
     words: dict[int, int] = {}
@@ -107,9 +106,9 @@ def read_request(unit: int, block: Block) -> bytes:
 
 
 def read_answer(unit: int, block: Block) -> Callable[[ModbusFrame], bytes | None]:
-    """Return a matcher for the reply to a read that returns the block's bytes.
+    """Return a matcher for the reply to a read; it returns the block's bytes.
 
-    It raises ExchangeRefusedError for an exception, well or malformed.
+    It raises ExchangeRefusedError for an exception, well-formed or malformed.
     """
 
     def accept(frame: ModbusFrame) -> bytes | None:

@@ -25,7 +25,7 @@ from math import inf
 from typing import Final
 
 from ..errors import RefusedOrderError
-from ..model import MAXIMUM_CURRENT, MINIMUM_CURRENT, Supply
+from ..model import MAXIMUM_CURRENT, MINIMUM_CURRENT, Circuit
 from ..safety import number, round_down
 
 LOWEST: Final = 60
@@ -39,17 +39,17 @@ _STEP: Final = 0.1
 """A, on the wire."""
 
 
-def checked(supply: Supply) -> Supply:
-    """Return a supply, rounded down to the step of the wire.
+def checked(circuit: Circuit) -> Circuit:
+    """Return a circuit, its values rounded down to the step of the wire.
 
     Raises RefusedOrderError for values out of range.
     """
-    limit = number(supply.limit, "limit of the supply")
-    minimum = number(supply.minimum, "minimum of a charger")
+    limit = number(circuit.limit, "limit of the supply")
+    minimum = number(circuit.minimum, "minimum of a charger")
     if not MINIMUM_CURRENT <= minimum <= MAXIMUM_CURRENT:
         message = f"{minimum:g} A is no minimum of a charger ({MINIMUM_CURRENT:g} A)"
         raise RefusedOrderError(message)
-    return Supply(limit=round_down(limit, _STEP), minimum=round_down(minimum, _STEP))
+    return Circuit(limit=round_down(limit, _STEP), minimum=round_down(minimum, _STEP))
 
 
 def offered(value: int) -> int:
