@@ -11,7 +11,7 @@ import pytest
 
 from custom_components.evse_bus.diagnostics import async_get_config_entry_diagnostics
 from custom_components.evse_bus.discovery import MOST_OFFERS
-from custom_components.evse_bus.evse.ews import Stranger
+from custom_components.evse_bus.evse.ews import UnknownBox
 from tests.common import bus_entry, get_entity, wait_for_state, wait_until
 from tests.flow import Flow, box as typed_box, fields, ignore, offers
 from tests.listening import (
@@ -36,11 +36,9 @@ FAST = {"poll_interval": 0.2}
 
 async def dial_again(dialler: EwsDialler, entry: MockConfigEntry) -> None:
     """Let a box that is not set up dial once more, and say who it is."""
-    before = listener_of(entry).statistics.strangers
+    before = listener_of(entry).statistics.unknown
     dialler.hang_up()
-    await dialler.wait_for_async(
-        lambda: listener_of(entry).statistics.strangers > before
-    )
+    await dialler.wait_for_async(lambda: listener_of(entry).statistics.unknown > before)
 
 
 # -- Added -------------------------------------------------------------------------
@@ -148,7 +146,7 @@ async def test_box_that_is_set_up_on_a_serial_line_is_not_offered(
     serial.add_to_hass(hass)
     async with listening(hass) as entry:
         with dialling(entry) as dialler:
-            await dialler.wait_for_async(lambda: listener_of(entry).strangers)
+            await dialler.wait_for_async(lambda: listener_of(entry).unknown_boxes)
             await dial_again(dialler, entry)
             await hass.async_block_till_done(wait_background_tasks=True)
             assert not hass.config_entries.flow.async_progress()
@@ -173,8 +171,8 @@ async def test_many_serial_numbers_are_not_that_many_offers(
         hass.set_state(CoreState.starting)
     async with listening(hass) as entry:
         for number in range(MOST_OFFERS + 4):
-            stranger = Stranger(serial=f"{number:012d}", firmware="X", peer=None)
-            listener_of(entry).on_stranger(stranger)
+            stranger = UnknownBox(serial=f"{number:012d}", firmware="X", peer=None)
+            listener_of(entry).on_unknown_box(stranger)
         if starting:
             # Home Assistant would keep an offer for each until it has started.
             dispatcher = hass.data.get(DISCOVERY_FLOW_DISPATCHER)
@@ -193,7 +191,7 @@ async def test_box_that_dials_while_home_assistant_starts(
     hass.set_state(CoreState.starting)
     async with listening(hass) as entry:
         with dialling(entry) as dialler:
-            await dialler.wait_for_async(lambda: listener_of(entry).strangers)
+            await dialler.wait_for_async(lambda: listener_of(entry).unknown_boxes)
             assert not hass.config_entries.flow.async_progress()
             if meanwhile == "set up":
                 hass.config_entries.async_add_subentry(

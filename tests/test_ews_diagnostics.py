@@ -246,7 +246,7 @@ async def test_nothing_private_over_the_network(
             nobody.sendall(b"x" * 10_000)
             statistics = entry.runtime_data.connections.listener.statistics
             await dialler.wait_for_async(lambda: statistics.unidentified)
-        assert "did not say who it is" in caplog.text
+        assert "was not identified" in caplog.text
         dialler.dial()
         await wait_for_state(hass, status, "charging")
         await polled(dialler, box)

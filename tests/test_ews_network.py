@@ -140,7 +140,7 @@ async def test_a_new_connection_takes_the_place_of_a_half_open_one(
         await wait_until(hass, lambda: listener.statistics.replaced == 1)
         await wait_for_state(hass, status, "available")
         await polled(dialler, box)
-        assert listener.statistics.seconds == 0
+        assert listener.statistics.duplicates == 0
 
 
 # -- Nothing is left behind ------------------------------------------------------

@@ -54,7 +54,7 @@ async def test_a_stranger_hears_who_are_you_and_nothing_else(
             assert stranger.ports[0].start_mode == 1
             assert not stranger.ports[0].contactor
         assert state_of(hass, BOXES) == "1"
-        assert entry.runtime_data.connections.listener.statistics.strangers >= 1
+        assert entry.runtime_data.connections.listener.statistics.unknown >= 1
 
 
 async def test_a_second_box_with_the_same_number_is_refused(
@@ -67,14 +67,14 @@ async def test_a_second_box_with_the_same_number_is_refused(
         listener = entry.runtime_data.connections.listener
         with dialler_of(entry, double) as second:
             await second.wait_for_async(lambda: len(second.dropped) > 2, timeout=20)
-            assert listener.statistics.seconds > 1
+            assert listener.statistics.duplicates > 1
             await call(hass, "number.set_value", limit, value=10)
             assert box.ports[0].limit == 10
             assert double.ports[0].limit == 0
             assert {one.name for one in double.commands} == {"id", "rs"}
         assert state_of(hass, status) == "available"
         assert dialler.attempts == 1
-        assert said(caplog, "says that it is Yard") == 1
+        assert said(caplog, "gives the number of Yard") == 1
         # Once the first one is gone the number is free.
         dialler.hang_up(redial=False)
         await wait_for_state(hass, status, "unavailable")
@@ -103,7 +103,7 @@ async def test_a_box_that_is_removed_is_offered_again(hass: HomeAssistant) -> No
 
 
 async def test_another_box_takes_the_place_of_one(hass: HomeAssistant) -> None:
-    """The user says that it is a new one: entities stay, the old box is a stranger."""
+    """The user says that it is a new one: entities stay, the old box is an unknown one."""
     old, new = EwsBox(), EwsBox(serial="012345678902")
     async with listening(hass, old) as (entry, (dialler,)):
         limit = await get_entity(hass, "number", entry, "2_charging_current")

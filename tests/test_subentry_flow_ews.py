@@ -316,7 +316,8 @@ async def test_another_serial_number_is_another_box(hass: HomeAssistant) -> None
             # The new one is no longer offered, and the old one is.
             await offered(hass, SERIAL)
             await wait_until(hass, lambda: list(offers(hass)) == [f"EWS-Box {SERIAL}"])
-            assert list(listener_of(entry).peers) == [OTHER]
+            unknown = listener_of(entry).unknown_boxes
+            assert [one.serial for one in unknown] == [SERIAL]
             await wait_for_state(hass, status, "available")
             chargers = entry.runtime_data.chargers.values()
             assert {managed.charger.info.serial for managed in chargers} == {OTHER}

@@ -16,7 +16,7 @@ from homeassistant.const import CONF_DEVICE, CONF_HOST, CONF_PORT
 from .configuration import line_settings, protocol_of, supply_of
 from .const import CONF_ALLOWED
 from .evse.bus import Bus
-from .evse.ews import Listener, Stranger
+from .evse.ews import Listener, UnknownBox
 from .evse.master import BusMaster
 from .evse.model import ChargerConfig
 
@@ -101,7 +101,7 @@ class ListenerConnections(Connections):
     """A listener, and one bus for each configured box."""
 
     def __init__(
-        self, entry: ConfigEntry, on_unknown_box: Callable[[Stranger], None]
+        self, entry: ConfigEntry, on_unknown_box: Callable[[UnknownBox], None]
     ) -> None:
         """Create the listener; it does not accept connections yet.
 
@@ -112,7 +112,7 @@ class ListenerConnections(Connections):
             entry.data[CONF_HOST],
             entry.data[CONF_PORT],
             allowed=allowed_networks(entry.options),
-            on_stranger=on_unknown_box,
+            on_unknown_box=on_unknown_box,
         )
         self._buses: dict[str, Bus] = {}
         self._started = False
@@ -144,7 +144,7 @@ class ListenerConnections(Connections):
     @override
     async def acquire_bus(self, config: ChargerConfig, name: str) -> Bus:
         serial = config.serial or ""
-        bus = self._buses[serial] = self.listener.expect(serial, name)
+        bus = self._buses[serial] = self.listener.register(serial, name)
         if self._started:
             await bus.start()
         return bus
@@ -159,7 +159,7 @@ class ListenerConnections(Connections):
 
     async def _remove(self, serial: str) -> None:
         del self._buses[serial]
-        await self.listener.forget(serial)
+        await self.listener.unregister(serial)
 
     @override
     def update_options(self, options: Mapping[str, Any]) -> None:
@@ -167,7 +167,7 @@ class ListenerConnections(Connections):
 
 
 def make_connections(
-    entry: ConfigEntry, on_unknown_box: Callable[[Stranger], None]
+    entry: ConfigEntry, on_unknown_box: Callable[[UnknownBox], None]
 ) -> Connections:
     """Return the connections of a config entry; nothing is opened."""
     if protocol_of(entry.data).dials_in:

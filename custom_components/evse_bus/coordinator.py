@@ -252,7 +252,9 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
             )
         managed.bus.add(charger)
         if isinstance(charger, EwsPort):
-            managed.subscriptions.append(charger.subscribe_events(managed.events.tell))
+            managed.subscriptions.append(
+                charger.subscribe_events(managed.events.publish)
+            )
 
     async def _async_commit(self, managed: ManagedCharger, orders: Orders) -> None:
         self.issues.orders_renewed(managed)

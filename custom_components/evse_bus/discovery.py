@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     )
     from homeassistant.core import HomeAssistant
 
-    from .evse.ews import Listener, Stranger
+    from .evse.ews import Listener, UnknownBox
 
 CONF_ENTRY: Final = "entry_id"
 CONF_FIRMWARE: Final = "firmware"
@@ -39,14 +39,14 @@ _DISCOVERED: Final[ConfigFlowContext] = {"source": SOURCE_INTEGRATION_DISCOVERY}
 
 @callback
 def async_wants_to_connect(
-    hass: HomeAssistant, entry: ConfigEntry, stranger: Stranger
+    hass: HomeAssistant, entry: ConfigEntry, found: UnknownBox
 ) -> None:
     """Start a discovery flow for an unknown box that has dialled."""
     if hass.state is not CoreState.running:
         # Until it has started, Home Assistant would queue any number of flows.
         return
     protocol = protocol_of(entry.data)
-    unique_id = protocol.unique_id(stranger.serial)
+    unique_id = protocol.unique_id(found.serial)
     flows = hass.config_entries.flow.async_progress_by_handler(
         DOMAIN, include_uninitialized=True, match_context=dict(_DISCOVERED)
     )
@@ -59,9 +59,9 @@ def async_wants_to_connect(
         data={
             CONF_ENTRY: entry.entry_id,
             CONF_PROTOCOL: protocol.key,
-            CONF_SERIAL: stranger.serial,
-            CONF_FIRMWARE: stranger.firmware,
-            CONF_PEER: str(stranger.peer or ""),
+            CONF_SERIAL: found.serial,
+            CONF_FIRMWARE: found.firmware,
+            CONF_PEER: str(found.peer or ""),
         },
         # Home Assistant signals by this key when the box is no longer ignored.
         discovery_key=DiscoveryKey(domain=DOMAIN, key=unique_id, version=1),
@@ -79,8 +79,8 @@ def async_offer_when_started(
 
     @callback
     def started(_hass: HomeAssistant) -> None:
-        for stranger in listener.strangers:
-            async_wants_to_connect(hass, entry, stranger)
+        for found in listener.unknown_boxes:
+            async_wants_to_connect(hass, entry, found)
 
     return async_at_started(hass, started)
 
@@ -97,9 +97,9 @@ def async_follow_ignored(
 
     @callback
     def removed(ignored: ConfigEntry) -> None:
-        for stranger in listener.strangers:
-            if protocol.unique_id(stranger.serial) == ignored.unique_id:
-                async_wants_to_connect(hass, entry, stranger)
+        for found in listener.unknown_boxes:
+            if protocol.unique_id(found.serial) == ignored.unique_id:
+                async_wants_to_connect(hass, entry, found)
 
     signal = signal_discovered_config_entry_removed(DOMAIN)
     return async_dispatcher_connect(hass, signal, removed)

@@ -515,7 +515,7 @@ LISTENER_SENSORS: Final[tuple[ListenerSensorDescription, ...]] = (
     _listener_count("not_allowed", lambda listener: listener.statistics.not_allowed),
     _listener_count("crowded_out", lambda listener: listener.statistics.crowded_out),
     _listener_count("unidentified", lambda listener: listener.statistics.unidentified),
-    _listener_count("strangers", lambda listener: listener.statistics.strangers),
-    _listener_count("seconds", lambda listener: listener.statistics.seconds),
+    _listener_count("strangers", lambda listener: listener.statistics.unknown),
+    _listener_count("seconds", lambda listener: listener.statistics.duplicates),
     _listener_count("replaced", lambda listener: listener.statistics.replaced),
 )

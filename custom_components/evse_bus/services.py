@@ -172,7 +172,7 @@ def _target(
         raise wrong_action(ActionError.NOT_EWS_BOX, device=_name(device))
     if of_port and len(ports) > 1:
         raise wrong_action(ActionError.CHOOSE_PORT, device=_name(device))
-    managed, charger = min(ports, key=lambda one: one[1].port)
+    managed, charger = min(ports, key=lambda one: one[1].number)
     return coordinator, managed, charger
 
 

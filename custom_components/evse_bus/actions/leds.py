@@ -52,7 +52,7 @@ async def set_leds(port: EwsPort, given: Mapping[str, object]) -> None:
     other = PortLeds()
     if leds == other:
         raise wrong_action(ActionError.NOTHING_TO_CHANGE)
-    first, second = (leds, other) if port.port == 1 else (other, leds)
+    first, second = (leds, other) if port.number == 1 else (other, leds)
     await port.services.set_leds(first, second)
 
 

@@ -122,7 +122,7 @@ class ActionBlock[T]:
 
     def response(self, values: T) -> JsonObjectType:
         """Return the values of a block that was read, without its secrets."""
-        secrets = self.block.secrets_told(values)
+        secrets = self.block.shown_secrets(values)
         response: JsonObjectType = {
             parameter.key: parameter.response(values)
             for parameter in self.parameters

@@ -100,11 +100,11 @@ class ChargerSubentryFlow(
         connections = self._connections()
         if not isinstance(connections, ListenerConnections):
             return []
-        strangers = connections.listener.strangers
+        unknown = connections.listener.unknown_boxes
         self._result = ScanResult(
-            found=tuple(found_box(one.serial, one.firmware) for one in strangers)
+            found=tuple(found_box(one.serial, one.firmware) for one in unknown)
         )
-        return [one.serial for one in strangers]
+        return [one.serial for one in unknown]
 
     @override
     async def async_scan(self, progress: Progress) -> ScanResult:

@@ -44,7 +44,7 @@ async def server(**options: object) -> AsyncIterator[Listener]:
 async def expected(
     made: Listener, serial: str = SERIAL, ports: tuple[int, ...] = (1, 2)
 ) -> AsyncIterator[Bus]:
-    bus = made.expect(serial)
+    bus = made.register(serial)
     for port in ports:
         bus.add(
             EwsPort(
@@ -63,7 +63,7 @@ async def expected(
     try:
         yield bus
     finally:
-        await made.forget(serial)
+        await made.unregister(serial)
 
 
 @contextmanager

@@ -10,10 +10,10 @@ from typing import Any, Self, override
 from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.errors import LineLostError
 from custom_components.evse_bus.evse.ews import PROTOCOL
-from custom_components.evse_bus.evse.ews.box import Ports
 from custom_components.evse_bus.evse.ews.charger import EwsPort
 from custom_components.evse_bus.evse.ews.config import EwsPortConfig
 from custom_components.evse_bus.evse.ews.events import Event
+from custom_components.evse_bus.evse.ews.port import BoxPorts
 from custom_components.evse_bus.evse.ews.timing import SETTINGS
 from custom_components.evse_bus.evse.framing import Timing
 from custom_components.evse_bus.evse.line import Line
@@ -188,7 +188,7 @@ class EwsScene:
         self.line = Ether()
         self.cars = (Car(max_current=32.0), Car(max_current=32.0))
         self.bus = Bus(
-            self.line, PROTOCOL.framer(), self.timing, "simulated", group=Ports()
+            self.line, PROTOCOL.framer(), self.timing, "simulated", group=BoxPorts()
         )
         for port in self.ports:
             self.bus.add(self.make_charger(port))

@@ -74,13 +74,13 @@ SAID = {
     5: "the cable does not fit",
     6: "could not be locked or unlocked",
     7: "contactor",
-    8: "the manual does not know",
+    8: "not in the manual",
     9: "not ready yet",
     10: "card reader is missing",
     11: "residual current device has tripped",
     12: "the other port",
-    13: "the manual does not know",
-    255: "the manual does not know",
+    13: "not in the manual",
+    255: "not in the manual",
 }
 
 

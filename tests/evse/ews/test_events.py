@@ -43,7 +43,7 @@ def port(session: tuple[int, int], last: tuple[int, int]) -> PortStatus:
 
 
 @pytest.mark.parametrize(
-    ("running", "seen"),
+    ("running", "status"),
     [
         # Taken over; the counters stay, or begin anew.
         (port((90, 900), (5, 50)), port((100, 1000), (100, 1000))),
@@ -59,8 +59,8 @@ def port(session: tuple[int, int], last: tuple[int, int]) -> PortStatus:
         (None, port((0, 0), (100, 1000))),
     ],
 )
-def test_what_has_been_charged(running: PortStatus | None, seen: PortStatus) -> None:
-    ended = charge_ended(2, running, seen)
+def test_what_has_been_charged(running: PortStatus | None, status: PortStatus) -> None:
+    ended = charge_ended(2, running, status)
     assert ended == ChargeEnded(
         port=2, result=ChargeResult.STOPPED, energy=1000, duration=100
     )

@@ -12,7 +12,7 @@ from custom_components.evse_bus.evse.errors import (
 from custom_components.evse_bus.evse.ews.charger import EwsPort
 from custom_components.evse_bus.evse.ews.config import EwsPortConfig
 from custom_components.evse_bus.evse.ews.network import line, listener as listening
-from custom_components.evse_bus.evse.ews.network.listener import Listener, Stranger
+from custom_components.evse_bus.evse.ews.network.listener import Listener, UnknownBox
 from custom_components.evse_bus.evse.model import CurrentLimit, OrderChange, Orders
 from tests.virtual import Car
 from tests.virtual.ews_box import EwsBox as VirtualBox
@@ -70,9 +70,9 @@ def test_a_box_dials_and_charges() -> None:
 
 def test_a_stranger_is_told_of_and_gets_nothing_but_its_identification() -> None:
     async def scene() -> None:
-        told: list[Stranger] = []
+        told: list[UnknownBox] = []
         box = VirtualBox(serial="099999999999")
-        async with server(on_stranger=told.append) as made:
+        async with server(on_unknown_box=told.append) as made:
             with dialling(made, box):
                 await until(lambda: told)
                 await asyncio.sleep(0.3)
@@ -128,7 +128,7 @@ def test_a_second_connection_with_the_same_number_is_refused() -> None:
             with dialling(made, box) as dialler:
                 await until(lambda: has_reading(bus))
                 with dialling(made, false):
-                    await until(lambda: made.statistics.seconds >= 3)
+                    await until(lambda: made.statistics.duplicates >= 3)
                     assert {one.name for one in false.commands} <= {"id", "rs"}
                     assert not dialler.dropped
                     assert dialler.opened == 1
@@ -230,7 +230,7 @@ def test_fifty_boxes() -> None:
             buses = []
             async with asyncio.TaskGroup() as group:
                 for serial in serials:
-                    bus = made.expect(serial)
+                    bus = made.register(serial)
                     buses.append(bus)
                     bus.add(
                         EwsPort(
@@ -258,7 +258,7 @@ def test_fifty_boxes() -> None:
                 assert sum(bus.wire.statistics.missed_deadlines for bus in buses) == 0
                 assert all(has_reading(bus) for bus in buses)
             for serial in serials:
-                await made.forget(serial)
+                await made.unregister(serial)
 
     run(scene)
 
@@ -277,7 +277,7 @@ def test_a_port_that_is_taken_and_an_address_that_is_not_ours() -> None:
 def test_a_bus_that_is_stopped_leaves_nothing() -> None:
     async def scene() -> None:
         async with server() as made:
-            bus = made.expect(SERIAL)
+            bus = made.register(SERIAL)
             await bus.start()
             with dialling(made) as dialler:
                 await until(lambda: bus.connected)
@@ -287,6 +287,6 @@ def test_a_bus_that_is_stopped_leaves_nothing() -> None:
                     await bus.run(lambda _turn: asyncio.sleep(0))  # type: ignore[arg-type, return-value]
                 await bus.start()
                 await until(lambda: bus.connected)
-            await made.forget(SERIAL)
+            await made.unregister(SERIAL)
 
     run(scene)

@@ -34,7 +34,7 @@ HERE = ip_network("127.0.0.0/8")
 
 def is_empty(made: Listener) -> bool:
     """Return whether nothing is kept of anybody."""
-    kept = (made._unidentified, made._identified, made._strangers, made._bound)
+    kept = (made._unidentified, made._identified, made._unknown, made._bound)
     return not any(kept) and not made._timers
 
 
@@ -48,7 +48,7 @@ def test_who_may_not_connect_any_more_is_hung_up_on() -> None:
                 dialling(made, VirtualBox(serial=OTHER)) as other,
                 stranger(made) as silent,
             ):
-                await until(lambda: has_reading(bus) and made.strangers)
+                await until(lambda: has_reading(bus) and made.unknown_boxes)
                 made.allow([HERE])
                 await asyncio.sleep(0.2)
                 assert not box.dropped
@@ -65,7 +65,7 @@ def test_who_may_not_connect_any_more_is_hung_up_on() -> None:
                 assert is_empty(made)
                 assert not first(bus).available
                 made.allow(())
-                await until(lambda: has_reading(bus) and made.strangers)
+                await until(lambda: has_reading(bus) and made.unknown_boxes)
 
     run(scene)
 
@@ -80,7 +80,7 @@ def test_one_that_waits_to_take_a_place_is_hung_up_on(
             with dialling(made) as box:
                 await until(lambda: has_reading(bus))
                 box.vanish()
-                await until(lambda: made._asking)
+                await until(lambda: made._proving)
                 made.allow([ELSEWHERE])
                 assert is_empty(made)
                 made.allow([])
@@ -92,18 +92,20 @@ def test_one_that_waits_to_take_a_place_is_hung_up_on(
 def test_who_is_there() -> None:
     async def scene() -> None:
         async with server() as made, expected(made) as bus:
-            assert (made.strangers, made.peers) == ((), {})
+            assert not made.unknown_boxes
+            assert not bus.connected
             with dialling(made), dialling(made, VirtualBox(serial=OTHER)) as other:
-                await until(lambda: has_reading(bus) and made.strangers)
-                assert made.peers == {SERIAL: ip_address(HOST)}
-                (told,) = made.strangers
-                assert (told.serial, told.peer) == (OTHER, ip_address(HOST))
-                assert told.firmware == "M165300103"
+                await until(lambda: has_reading(bus) and made.unknown_boxes)
+                (found,) = made.unknown_boxes
+                assert (found.serial, found.peer) == (OTHER, ip_address(HOST))
+                assert found.firmware == "M165300103"
                 other.hang_up(redial=False)
-                await until(lambda: not made.strangers)
-                await made.forget(SERIAL)
-                assert not made.peers
-                await until(lambda: [one.serial for one in made.strangers] == [SERIAL])
+                await until(lambda: not made.unknown_boxes)
+                await made.unregister(SERIAL)
+                assert not bus.connected
+                await until(
+                    lambda: [one.serial for one in made.unknown_boxes] == [SERIAL]
+                )
 
     run(scene)
 
@@ -111,21 +113,21 @@ def test_who_is_there() -> None:
 def test_a_stranger_that_is_set_up_in_time_stays(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(listening, "STRANGER_TIME", 0.5)
+    monkeypatch.setattr(listening, "UNKNOWN_TIME", 0.5)
 
     async def scene() -> None:
         async with server() as made:
             with dialling(made) as box:
-                await until(lambda: made.strangers)
+                await until(lambda: made.unknown_boxes)
                 async with expected(made) as bus:
-                    assert not made.strangers
-                    assert made.peers == {SERIAL: ip_address(HOST)}
+                    assert not made.unknown_boxes
+                    assert list(made._bound) == [SERIAL]
                     await asyncio.sleep(1.0)
                     assert not box.dropped
                     assert box.opened == 1
                     assert has_reading(bus)
                 # It is a stranger again, and then kept for so long only.
-                await until(lambda: made.strangers)
+                await until(lambda: made.unknown_boxes)
                 times = box.opened
                 await until(lambda: box.opened > times)
             await until(lambda: is_empty(made))
@@ -151,8 +153,8 @@ def test_a_box_that_gives_another_number_later_keeps_nobody_out() -> None:
                 with dialling(made):
                     await until(lambda: has_reading(bus))
                     assert Fault.WRONG_CHARGER not in first(bus).faults
-                    await until(lambda: made.strangers)
-                    assert made.strangers[0].serial == OTHER
+                    await until(lambda: made.unknown_boxes)
+                    assert made.unknown_boxes[0].serial == OTHER
                 assert len(false.writes) == writes
 
     run(scene)
@@ -170,9 +172,9 @@ def test_a_listener_that_stops_leaves_no_connection_behind(
                 dialling(made, VirtualBox(serial=OTHER)),
                 stranger(made) as silent,
             ):
-                await until(lambda: has_reading(bus) and made.strangers)
+                await until(lambda: has_reading(bus) and made.unknown_boxes)
                 box.vanish()
-                await until(lambda: made._asking)
+                await until(lambda: made._proving)
                 assert made._unidentified
                 await made.stop()
                 assert not made._timers

@@ -10,10 +10,10 @@ from custom_components.evse_bus.evse.errors import (
     NotAvailableError,
     NotConfirmedError,
 )
-from custom_components.evse_bus.evse.ews.box import Ports
 from custom_components.evse_bus.evse.ews.events import (
     ChargeEnded,
 )
+from custom_components.evse_bus.evse.ews.port import BoxPorts
 from custom_components.evse_bus.evse.ews.wire.answers import EwsRefusedError, Refusal
 from custom_components.evse_bus.evse.model import Fault, OrderChange, Status
 
@@ -100,7 +100,7 @@ def test_a_late_answer_to_an_older_look_is_not_trusted(late: float) -> None:
         await scene.charge()
         begin = now()
         scene.line.held_until = now() + late
-        scene.charger().ask_now()
+        scene.charger().poll_now()
         await asyncio.sleep(0.3)
         # The cable stays locked, as after a pause of somebody else's.
         scene.box.ports[0].pause()
@@ -211,7 +211,7 @@ def test_a_restart_of_ours_does_not_unlock_what_we_have_paused(
         old = scene.charger()
         await scene.bus.remove(old)
         scene.allowed = False
-        scene.bus.group = Ports()
+        scene.bus.group = BoxPorts()
         scene.bus.add(scene.make_charger(1))
         await scene.until(lambda: scene.charger().reading is not None)
         await scene.charger().change_orders(OFF)

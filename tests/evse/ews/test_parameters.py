@@ -244,7 +244,7 @@ def test_whether_a_secret_was_read_can_be_said_later(secret: bytes) -> None:
     # Spaces around a text are not kept.
     assume(text == text.strip())
     told = USER_BLOCK.decode(secret + USER[12:])
-    assert USER_BLOCK.secrets_told(told) == {"user_password": shown(secret)}
+    assert USER_BLOCK.shown_secrets(told) == {"user_password": shown(secret)}
 
 
 @pytest.mark.parametrize(

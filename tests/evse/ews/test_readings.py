@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from custom_components.evse_bus.evse.ews import NETWORK, PROTOCOL
-from custom_components.evse_bus.evse.ews.box import Installation, Told
+from custom_components.evse_bus.evse.ews.box import Installation, Snapshot
 from custom_components.evse_bus.evse.ews.readings import (
     capabilities_of,
     charger_reading,
@@ -44,13 +44,13 @@ def connector(port: int = 1, **changes: object) -> ConnectorReading:
     """Return what is made of one port, with fields of its status changed."""
     ports = list(decode_ports(PORTS))
     ports[port - 1] = replace(ports[port - 1], **changes)  # type: ignore[arg-type]
-    told = Told(
+    snapshot = Snapshot(
         ports=tuple(ports),
         details=decode_details(DETAILS),
         status=decode_box(BOX),
         installation=Installation(),
     )
-    reading = charger_reading(port, told, paused=False)
+    reading = charger_reading(port, snapshot, paused=False)
     assert list(reading.connectors) == [port]
     return reading.connectors[port]
 

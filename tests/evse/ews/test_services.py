@@ -313,7 +313,7 @@ def test_firmware_in_pieces() -> None:
 
     async def acts(scene: EwsScene) -> None:
         done: list[float] = []
-        await upload(scene.charger(), image, done.append)
+        await upload(scene.charger().services, image, done.append)
         assert [len(one.parameters) - 8 for one in scene.line.named("ow")] == [
             1024,
             1024,
@@ -333,7 +333,7 @@ def test_a_slow_erasure_is_waited_for() -> None:
     async def acts(scene: EwsScene) -> None:
         scene.line.mute = lambda _name: False
         scene.box.faults.once("late", 8.0)
-        await upload(scene.charger(), b"\1\2\3")
+        await upload(scene.charger().services, b"\1\2\3")
         assert scene.box.activated == [b"\1\2\3"]
 
     async def run(scene: EwsScene) -> None:
@@ -350,7 +350,7 @@ def test_an_upload_with_a_lost_answer_ends_there(lost: str) -> None:
     async def acts(scene: EwsScene) -> None:
         scene.line.deaf = lambda name: name == lost
         with pytest.raises(NotConfirmedError):
-            await upload(scene.charger(), bytes(3000))
+            await upload(scene.charger().services, bytes(3000))
         assert not scene.box.activated
         assert len(scene.line.named(lost)) == 1
         await scene.until(lambda: scene.charger().available)
@@ -361,7 +361,7 @@ def test_an_upload_with_a_lost_answer_ends_there(lost: str) -> None:
 def test_no_image_is_no_firmware() -> None:
     async def acts(scene: EwsScene) -> None:
         with pytest.raises(RefusedOrderError):
-            await upload(scene.charger(), b"")
+            await upload(scene.charger().services, b"")
         assert not scene.line.named("oe")
 
     play(EwsScene(), acts)

@@ -50,7 +50,7 @@ MANUAL: dict[int, tuple[Status, bool | None, bool | None, Fault | None]] = {
 
 
 def port(code: int, **changes: object) -> PortStatus:
-    return replace(IDLE, status=code, **changes)  # type: ignore[arg-type]
+    return replace(IDLE, state=code, **changes)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("code", MANUAL)

@@ -30,7 +30,7 @@ from .wire import BOX, DETAILS, DHCP, PORT_CHARGING, PORT_IDLE, PORTS
 
 MAX = Card(group=7, number=42, user="Max M")
 CHARGING = PortStatus(
-    status=0x41,
+    state=0x41,
     cable_current=32,
     offered_current=16,
     flags=PortFlags.VENTILATION,
@@ -70,7 +70,7 @@ def test_rc() -> None:
     assert first == CHARGING
     assert first.start is StartRelease.RELEASED
     assert first.result is ChargeResult.PILOT_LOST
-    assert second.status == 0
+    assert second.state == 0
     assert second.total_energy == 100
     assert (second.session_time, second.last_energy, second.meter_cycles) == (0, 0, 0)
     assert (second.locked, second.contactor, second.rcd_tripped) == (False,) * 3
@@ -90,7 +90,7 @@ def test_codes_that_the_manual_does_not_know_stay_raw() -> None:
     for code in range(256):
         data = changed(changed(changed(PORTS, 0, code), 4, code), 6, code)
         port = decode_ports(data)[0]
-        assert (port.status, port.start_code, port.result_code) == (code, code, code)
+        assert (port.state, port.start_code, port.result_code) == (code, code, code)
         assert (port.start is None) == (code > 2)
         assert (port.result is None) == (code not in {1, 3, 4, 5, 6, 7, 8, 9})
 
@@ -121,7 +121,7 @@ def test_a_port_in_mode_1_does_not_know_all_of_it() -> None:
     assert other == CHARGING
     assert (port.cable_current, port.offered_current, port.locked) == (None,) * 3
     assert (port.pwm_minimum, port.pwm_maximum, port.cable_voltage) == (None,) * 3
-    assert (port.status, port.total_energy, port.contactor, port.card) == (
+    assert (port.state, port.total_energy, port.contactor, port.card) == (
         0x41,
         12345678,
         True,

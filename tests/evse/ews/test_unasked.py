@@ -30,14 +30,14 @@ def test_a_record_at_every_position_of_an_answer(name: str) -> None:
 
     async def acts(scene: EwsScene) -> None:
         for at in range(length + 1):
-            infos = scene.charger().box.changes
+            infos = scene.charger().box.info_count
             if name == "rd":
                 scene.box.mix_info(InfoMix("none"), InfoMix("inside", at=at))
             else:
                 scene.box.mix_info(InfoMix("inside", at=at))
-            scene.charger().ask_now()
+            scene.charger().poll_now()
             await asyncio.sleep(0.6)
-            assert scene.charger().box.changes > infos, at
+            assert scene.charger().box.info_count > infos, at
         assert scene.charger().statistics.timeouts == 0
         assert scene.charger().available
         assert scene.bus.wire.statistics.bad_frames == 0
@@ -53,14 +53,14 @@ def test_a_record_that_has_begun_when_the_next_command_goes(name: str) -> None:
     async def acts(scene: EwsScene) -> None:
         scene.line.lumps = 0
         for come in range(1, 16):
-            infos = scene.charger().box.changes
+            infos = scene.charger().box.info_count
             begun = InfoMix("after", cut=length + come, pause=0.02)
             scene.box.mix_info(*([InfoMix("none")] if name == "rd" else []), begun)
-            scene.charger().ask_now()
+            scene.charger().poll_now()
             # After rc comes rd; after that, what else waits.
-            scene.charger(2).ask_now()
+            scene.charger(2).poll_now()
             await asyncio.sleep(0.6)
-            assert scene.charger().box.changes == infos + 1, come
+            assert scene.charger().box.info_count == infos + 1, come
         assert scene.charger().statistics.timeouts == 0
         assert scene.charger().available
         assert scene.bus.wire.statistics.bad_frames == 0
@@ -113,7 +113,7 @@ def test_a_record_is_followed_by_a_poll_at_once() -> None:
         scene.box.press_key(1, 1)
         await scene.until(lambda: scene.connector().start_requested)
         assert now() - begin < 0.1
-        assert scene.charger().seen.start is StartRelease.REQUESTED  # type: ignore[union-attr]
+        assert scene.charger().last_status.start is StartRelease.REQUESTED  # type: ignore[union-attr]
 
     play(EwsScene(), acts)
 

@@ -12,6 +12,7 @@ from custom_components.evse_bus.evse.errors import (
     NotAvailableError,
     NotConfirmedError,
 )
+from custom_components.evse_bus.evse.ews.permission import Pause
 from custom_components.evse_bus.evse.ews.wire.answers import (
     START_STOP_CODES,
     EwsRefusedError,
@@ -68,7 +69,7 @@ def test_order_6_unlocks_in_two_states_only() -> None:
     known = decode_ports(PORTS)[0]
     allowed = {(0x50, 0), (0x50, 1), (0x50, 2), (0x30, 0), (0x30, 1)}
     for status, start, locked in product(range(0x100), range(3), (True, False, None)):
-        seen = replace(known, status=status, start_code=start, locked=locked)
+        seen = replace(known, state=status, start_code=start, locked=locked)
         if locked and (status, start) in allowed:
             assert unlock(2, seen).parameters == b"\x02\x06"
         else:
@@ -138,7 +139,7 @@ def test_our_pause_is_over(pause_status: int, order: int) -> None:
         await scene.charger().command(Command.UNLOCK)
         assert [one.parameters[1] for one in scene.line.orders(since=begin)] == [order]
         assert scene.unlocked() == [f"sl {order}"]
-        assert scene.charger().permission.paused is False
+        assert scene.charger().permission.pause_state is Pause.NONE
         await asyncio.sleep(20)
         assert scene.connector().status is Status.FINISHING
         begin = now()
@@ -261,18 +262,18 @@ def test_a_charge_that_begins_between_look_and_order_is_not_paused() -> None:
     async def acts(scene: EwsScene) -> None:
         await lock(scene)
         box = scene.charger().box
-        original, told = box.tell, []
+        original, told = box.send_command, []
 
-        async def tell(turn: Any, command: Any, make: Any) -> None:  # noqa: ANN401
+        async def send(turn: Any, command: Any, make: Any) -> None:  # noqa: ANN401
             if not told:
                 told.append(command)
                 scene.box.ports[0].release_start("somebody")
                 scene.box.step()
                 assert scene.status() == 0x40
-                box.hear(Info(changes=Change.PORT_1, keys=(0,) * 8))
+                box.on_info(Info(changes=Change.PORT_1, keys=(0,) * 8))
             await original(turn, command, make)
 
-        box.tell = tell  # type: ignore[method-assign]
+        box.send_command = send  # type: ignore[method-assign]
         since = now()
         await scene.charger().command(Command.UNLOCK)
         assert [one.parameters[1] for one in scene.line.orders(since=since)] == [STOP]
@@ -285,13 +286,13 @@ def test_records_without_end_are_not_waited_for() -> None:
     async def acts(scene: EwsScene) -> None:
         await lock(scene)
         box = scene.charger().box
-        original = box.tell
+        original = box.send_command
 
-        async def tell(turn: Any, command: Any, make: Any) -> None:  # noqa: ANN401
-            box.hear(Info(changes=Change.PORT_1, keys=(0,) * 8))
+        async def send(turn: Any, command: Any, make: Any) -> None:  # noqa: ANN401
+            box.on_info(Info(changes=Change.PORT_1, keys=(0,) * 8))
             await original(turn, command, make)
 
-        box.tell = tell  # type: ignore[method-assign]
+        box.send_command = send  # type: ignore[method-assign]
         since = now()
         with pytest.raises(NotConfirmedError):
             await scene.charger().command(Command.UNLOCK)
@@ -371,6 +372,6 @@ def test_a_refusal_says_why(code: int, monkeypatch: pytest.MonkeyPatch) -> None:
         assert told.value.reason is START_STOP_CODES.get(code, Refusal.UNKNOWN)
         assert told.value.code == code
         assert len(scene.line.orders(since=since)) == 1
-        assert scene.charger().permission.paused
+        assert scene.charger().permission.pause_state is Pause.OURS
 
     play(EwsScene(), acts)

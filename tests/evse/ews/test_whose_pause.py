@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from custom_components.evse_bus.evse.errors import EvseError
-from custom_components.evse_bus.evse.ews.box import Ports
+from custom_components.evse_bus.evse.ews.port import BoxPorts
 from custom_components.evse_bus.evse.model import CurrentLimit, OrderChange, Orders
 
 from .ether import EwsScene, now, play
@@ -24,7 +24,7 @@ def amperes(current: float) -> OrderChange:
 async def begin_anew(scene: EwsScene, orders: Orders, **config: float | None) -> None:
     """Let Home Assistant restart: it knows the orders and nothing else."""
     await scene.bus.remove(scene.charger())
-    scene.bus.group = Ports()
+    scene.bus.group = BoxPorts()
     charger = scene.make_charger(1)
     charger._config = replace(charger.config, **config)  # type: ignore[arg-type]
     scene.bus.add(type(charger)(charger.config, orders))

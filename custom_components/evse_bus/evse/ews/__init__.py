@@ -6,10 +6,10 @@ from typing import Final
 from ..address import TextAddress
 from ..protocol import Make, Protocol
 from ..redaction import SerialNumbers
-from .box import Ports
 from .charger import EwsPort
 from .config import EwsPortConfig
-from .network.listener import Listener, Stranger
+from .network.listener import Listener, UnknownBox
+from .port import BoxPorts
 from .scan import scan
 from .timing import SETTINGS, TCP_TIMING, TIMING
 from .wire.frames import EwsFramer
@@ -28,7 +28,7 @@ PROTOCOL: Final = Protocol(
     charger=EwsPort,
     scan=scan,
     ports=2,
-    group=Ports,
+    group=BoxPorts,
     interface="RS-232",
     address=replace(_SERIAL, any="", optional=True, single=True),
     asks_voltage=False,
@@ -56,5 +56,5 @@ __all__ = [
     "EwsPort",
     "EwsPortConfig",
     "Listener",
-    "Stranger",
+    "UnknownBox",
 ]

@@ -1,10 +1,9 @@
-"""What all ports of one EWS-Box share: who it is, and what it told last.
+"""What the ports of one EWS-Box share: its identity, its last readings, its clock.
 
-Two ports are one box on one line: one ``rc`` and one ``rd`` tell of both. The box is
-known when ``id`` and ``rs`` were answered since the line was opened; after a lost
-answer both are asked again, since another box may be there now, and because an answer
-that comes late must not be taken for one to a later command (answers have no number,
-but they come in their order).
+Two ports are one box on one line: one ``rc`` and one ``rd`` read both. The box is
+identified when ``id`` and ``rs`` were answered since the line was opened. After a lost
+reply both are asked again: another box may be there now, and a late reply must not be
+taken for the reply to a later command (replies have no number, but keep their order).
 """
 
 import asyncio
@@ -13,13 +12,11 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, tzinfo
 from functools import partial
 from math import inf
-from typing import Final, Protocol, cast, override
+from typing import Final
 
-from ..charger import Charger
 from ..conversation import rest
 from ..errors import ExchangeError, LineError, ReplyTimeoutError
 from ..exchange import Turn
-from ..master import ChargerGroup
 from ..throttle import RateLimiter
 from .events import CardPresented, Events
 from .timing import (
@@ -38,14 +35,14 @@ from .wire.parameters import EXTRA_BLOCK, SYSTEM_BLOCK, SystemMode, SystemParame
 from .wire.status import Details, Pair, PortStatus, decode_details, decode_ports
 
 MOST_KEYS: Final = 100
-"""Keys pressed or released in a second: nobody does more, and each is an event."""
-_OTHER_TRY: Final = 3
-"""Every so many tries the other reading of the checksum is tried."""
+"""Most key events reported per second: more cannot come from people."""
+_TRIES_PER_OTHER_BCC: Final = 3
+"""Each third try uses the other checksum than the one the box answered to before."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Installation:
-    """What of the parameters has to be known; the secrets are not kept."""
+    """The parameters that are needed here; the secret ones are not kept."""
 
     ports: int = 2
     mode: SystemMode | None = None
@@ -53,12 +50,12 @@ class Installation:
     fixed_cable: bool | None = None
     """``None``: not known."""
     maximum: Pair[int | None] = (None, None)
-    """Highest current of each port by parameter, A; ``None``: what the jumper says."""
+    """Highest current of each port by parameter, A; ``None``: set by the jumper."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Told:
-    """All that a box has told."""
+class Snapshot:
+    """All readings of a box."""
 
     ports: tuple[PortStatus, ...]
     details: Details
@@ -72,89 +69,91 @@ class EwsBox:
     def __init__(self) -> None:
         """Nothing is known before it answers."""
         self.events = Events()
-        self._keys = RateLimiter(MOST_KEYS, 1.0)
         self.clock: Callable[[], datetime] = partial(datetime.now, UTC)
-        """The right time."""
-        self.heard_at = -inf
-        """Loop time at which the last command that was answered had left."""
-        self.changes = 0
-        """How many info records have come."""
+        """Returns the correct time."""
+        self.last_answered_at = -inf
+        """Loop time at which the last answered command had been sent, s."""
+        self.info_count = 0
+        """Info records received."""
         self.restarts = 0
-        """How often the box has said that it was restarted."""
+        """Restarts that the box has reported."""
         self.bcc: Bcc | None = None
-        """How it counts the checksum; ``None``: not known."""
+        """The checksum it uses; ``None``: not known."""
+        self._key_limiter = RateLimiter(MOST_KEYS, 1.0)
         self._opened = -1
         self._tries = 0
         self.forget()
 
     def forget(self) -> None:
-        """Learn anew who it is before anything is written."""
+        """Drop all readings; the box is identified anew before anything is written."""
         self.firmware: str | None = None
         self.status: BoxStatus | None = None
         self.installation: Installation | None = None
         self.ports: tuple[PortStatus, ...] = ()
         self.details: Details | None = None
-        self.ports_at = -inf
-        """Loop time at which `ports` were read."""
         self.status_due = -inf
         self.parameters_due = -inf
+        self._ports_read_at = -inf
         self._answers = False
-        self._known = False
-        self._flagged = False
+        self._identified = False
+        self._restart_flag = False
         self._card_changed = False
         self._clock_after = -inf
 
-    def line_opened(self, times: int) -> None:
-        """Forget everything if the line was opened since the last call."""
+    def on_line_open(self, times: int) -> None:
+        """Drop all readings if the line was opened since the last call.
+
+        ``times``: how often it was opened. Each port calls this.
+        """
         if times != self._opened:
             self._opened = times
-            # The reading it was answered under last is the first to be tried.
+            # The checksum it answered to last is tried first.
             self._tries = 0
             self.forget()
 
     @property
-    def known(self) -> bool:
-        """Return whether it is known who answers."""
-        return self._known
+    def identified(self) -> bool:
+        """Return whether ``id`` and ``rs`` were answered, and no reply lost since."""
+        return self._identified
 
     @property
     def serial(self) -> str | None:
-        """Return its serial number."""
+        """Return its serial number; ``None``: not read yet."""
         return self.status.serial if self.status is not None else None
 
     @property
-    def told(self) -> Told | None:
-        """Return all that it told; ``None``: not all of it yet."""
+    def snapshot(self) -> Snapshot | None:
+        """Return all readings; ``None``: some are missing yet."""
         if self.details is None or self.status is None or self.installation is None:
             return None
-        return Told(
+        return Snapshot(
             ports=self.ports,
             details=self.details,
             status=self.status,
             installation=self.installation,
         )
 
-    # -- Asking --------------------------------------------------------------------
+    # -- Exchanges -----------------------------------------------------------------
 
     async def read[T](
         self, turn: Turn, command: CommandId, decode: Callable[[bytes], T]
     ) -> T:
-        """Return what the answer to a reading command says.
+        """Send a reading command; return its decoded reply.
 
         Raises ImplausibleReplyError, and what `Turn.exchange` raises.
         """
-        return await self.ask(turn, command, lambda: read(command), decode)
+        return await self.exchange(turn, command, lambda: read(command), decode)
 
-    async def tell(
+    async def send_command(
         self, turn: Turn, command: CommandId, make: Callable[[], Request]
     ) -> None:
-        """Say something that is answered by one byte; return when it was OK.
+        """Send a command that is confirmed by one byte; return when it was OK.
 
         Raises EwsRefusedError, and what `read` raises.
         """
-        await self.ask(turn, command, make, confirmed(command))
+        await self.exchange(turn, command, make, confirmed(command))
 
-    async def ask[T](
+    async def exchange[T](
         self,
         turn: Turn,
         command: CommandId,
@@ -163,7 +162,10 @@ class EwsBox:
         *,
         patience: float = 0.0,
     ) -> T:
-        """Have one exchange; ``make`` is asked right before its command goes."""
+        """Have one exchange; ``make`` is called right before its request is sent.
+
+        ``patience``: additional time for the reply, s.
+        """
         bcc = self.bcc or Bcc.ALL
         try:
             result = await turn.exchange(
@@ -172,65 +174,66 @@ class EwsBox:
                 patience=patience,
             )
         except ReplyTimeoutError, LineError:
-            self.doubt()
+            self.require_identification()
             raise
         except ExchangeError:
-            self._note(turn)
+            self._note_answered(turn)
             raise
-        self._note(turn)
+        self._note_answered(turn)
         return result
 
-    def doubt(self) -> None:
-        """Ask who it is before the next command: an answer was lost."""
-        self._answers = self._known = False
-        self.ports_at = -inf
+    def require_identification(self) -> None:
+        """Identify the box before the next command: a reply was lost."""
+        self._answers = self._identified = False
+        self.expire_ports()
 
-    def was_reset(self) -> None:
-        """Note that it restarts: it is another box now, as far as anybody can know."""
-        self._flagged = False
-        self.doubt()
+    def on_reset(self) -> None:
+        """Take note of a reset: after its restart it might be any box."""
+        self._restart_flag = False
+        self.require_identification()
 
-    def _note(self, turn: Turn) -> None:
+    def _note_answered(self, turn: Turn) -> None:
         if turn.sent_at is not None:
-            self.heard_at = turn.sent_at
+            self.last_answered_at = turn.sent_at
 
-    # -- Who it is -----------------------------------------------------------------
+    # -- Identity ------------------------------------------------------------------
 
-    async def identify(self, turn: Turn) -> BoxStatus:
-        """Ask who it is, under one reading of the checksum and the other, until told.
+    async def wait_for_status(self, turn: Turn) -> BoxStatus:
+        """Ask for ``id`` and ``rs``, with either checksum, until both are answered.
 
-        Nothing but ``id`` and ``rs``. Raises LineError, and ImplausibleReplyError or
-        ExchangeRefusedError for what is no EWS-Box; silence is the caller's to end.
+        Raises LineError, and ImplausibleReplyError or ExchangeRefusedError for replies
+        that no EWS-Box gives. Does not give up on silence: the caller limits the time.
         """
         while True:
             try:
-                await self._find_reading(turn)
+                await self._read_firmware_id(turn)
                 return await self.read_status(turn)
             except ReplyTimeoutError:
                 continue
 
-    async def meet(self, turn: Turn) -> None:
-        """Find out who answers, and what is installed, one exchange a turn.
+    async def identify(self, turn: Turn) -> None:
+        """Read ``id``, ``rs`` and the installation, one exchange a turn.
 
-        Two ports may do so at the same time: what one has learnt the other skips.
+        Two ports may do so at the same time: each skips what the other has read.
         Raises what `read` raises.
         """
-        while not self._known:
+        while not self._identified:
             if not self._answers:
-                await self._find_reading(turn)
+                await self._read_firmware_id(turn)
             else:
                 await self.read_status(turn)
-                self._known = True
+                self._identified = True
             await rest(0.0)
         if self.installation is None:
             await self.read_parameters(turn)
 
-    async def _find_reading(self, turn: Turn) -> None:
-        """Let it answer ``id``, under one reading of the checksum or the other."""
-        readings = tuple(Bcc)
-        usual = readings.index(self.bcc or readings[self._tries % 2])
-        other = self.bcc is not None and self._tries % _OTHER_TRY == _OTHER_TRY - 1
-        bcc = readings[usual ^ other]
+    async def _read_firmware_id(self, turn: Turn) -> None:
+        """Read ``id``, with one checksum or the other, and learn which one it uses."""
+        variants = tuple(Bcc)
+        usual = variants.index(self.bcc or variants[self._tries % 2])
+        last = _TRIES_PER_OTHER_BCC - 1
+        other = self.bcc is not None and self._tries % _TRIES_PER_OTHER_BCC == last
+        bcc = variants[usual ^ other]
         self._tries += 1
 
         def accept(frame: EwsFrame) -> tuple[str, Bcc] | None:
@@ -241,10 +244,10 @@ class EwsBox:
         self.firmware, self.bcc = await turn.exchange(request, accept)
         self._tries = 0
         self._answers = True
-        self._note(turn)
+        self._note_answered(turn)
 
     async def read_status(self, turn: Turn) -> BoxStatus:
-        """Read ``rs``: who it is, its clock, the card at the reader."""
+        """Read ``rs``: serial number, flags, clock, the card at the reader."""
         status = await self.read(turn, CommandId.READ_BOX, decode_box)
         before, self.status = self.status, status
         self.status_due = turn.now + BOX_INTERVAL
@@ -253,21 +256,24 @@ class EwsBox:
             self.ports = ()
             self.details = None
             before = None
-        flagged = BoxFlags.RESTARTED in status.flags
-        if flagged and not self._flagged:
-            self.restarts += 1
-            self.parameters_due = self._clock_after = -inf
-        self._flagged = flagged
-        self._tell_card(before, status)
+        self._check_restart(status)
+        self._report_card(before, status)
         return status
 
-    def _tell_card(self, before: BoxStatus | None, status: BoxStatus) -> None:
+    def _check_restart(self, status: BoxStatus) -> None:
+        restarted = BoxFlags.RESTARTED in status.flags
+        if restarted and not self._restart_flag:
+            self.restarts += 1
+            self.parameters_due = self._clock_after = -inf
+        self._restart_flag = restarted
+
+    def _report_card(self, before: BoxStatus | None, status: BoxStatus) -> None:
         card, changed = status.card, self._card_changed
         self._card_changed = False
         if card is None:
             return
         if changed or (before is not None and before.card != card):
-            self.events.tell(
+            self.events.publish(
                 CardPresented(
                     group=card.group,
                     number=card.number,
@@ -277,8 +283,10 @@ class EwsBox:
                 )
             )
 
+    # -- Installation --------------------------------------------------------------
+
     async def read_parameters(self, turn: Turn) -> None:
-        """Read what is installed; a box that does not tell is taken as it comes."""
+        """Read the installation; without a reply, the defaults are assumed."""
         self.parameters_due = turn.now + PARAMETERS_RETRY
         system: SystemParameters | None = None
         try:
@@ -287,7 +295,7 @@ class EwsBox:
             extra = await self.read(turn, EXTRA_BLOCK.read, EXTRA_BLOCK.decode)
         except ExchangeError:
             if system is not None:
-                # What one block tells counts, also when the other is not told.
+                # One block counts, also when the other could not be read.
                 self.installation = self._installation(system, None)
             self.installation = self.installation or Installation()
             return
@@ -297,55 +305,75 @@ class EwsBox:
     def _installation(
         self, system: SystemParameters, second: int | None
     ) -> Installation:
-        """Return what is installed; ``second``: port 2's maximum, if it was told."""
-        first = system.maximum_current or None
-        if second is not None:
-            return _installation(system, (first, second or first))
-        # The last that was known of port 2, as long as nothing else is.
-        before = self.installation.maximum[1] if self.installation else None
-        return _installation(system, (first, before or first))
+        """Return the installation; ``second``: port 2's maximum, A (0: as port 1).
 
-    # -- What it says --------------------------------------------------------------
+        ``second`` is ``None`` where it could not be read: the last known one counts.
+        """
+        first = system.maximum_current or None
+        if second is None:
+            second = self.installation.maximum[1] if self.installation else None
+        return Installation(
+            ports=system.ports,
+            mode=system.mode,
+            mode_1=system.mode_1,
+            fixed_cable=system.fixed_cable,
+            maximum=(first, second or first),
+        )
+
+    # -- Ports ---------------------------------------------------------------------
 
     async def refresh(self, turn: Turn, oldest: float) -> None:
-        """Read what is older than ``oldest`` (loop time): up to three exchanges."""
-        if self.ports_at < oldest or self.details is None:
-            await self.look(turn)
-            await self.look_closer(turn)
+        """Read what is older than ``oldest`` (loop time, s): up to three exchanges."""
+        if self._ports_read_at < oldest or self.details is None:
+            await self.read_ports(turn)
+            await self.read_details(turn)
         if turn.now >= self.status_due:
             await self.read_status(turn)
 
-    async def look(self, turn: Turn) -> tuple[PortStatus, ...]:
-        """Read ``rc``: how the ports are, right now."""
+    async def read_ports(self, turn: Turn) -> tuple[PortStatus, ...]:
+        """Read ``rc``: the status of the ports."""
         known = self.installation or Installation()
         decode = partial(decode_ports, mode_1=known.mode_1, count=known.ports)
-        changes = self.changes
+        infos = self.info_count
         self.ports = await self.read(turn, CommandId.READ_PORTS, decode)
-        # A record that came meanwhile says that they are not so any more.
-        self.ports_at = turn.now if changes == self.changes else -inf
+        # An info record that came meanwhile has outdated it.
+        self._ports_read_at = turn.now if infos == self.info_count else -inf
         return self.ports
 
-    async def look_closer(self, turn: Turn) -> Details:
+    async def read_details(self, turn: Turn) -> Details:
         """Read ``rd``: limit and power of the ports."""
         self.details = await self.read(turn, CommandId.READ_DETAILS, decode_details)
         return self.details
 
-    def hear(self, info: Info) -> None:
-        """Take an info record: what was read is old now."""
-        self.changes += 1
-        self.ports_at = -inf
+    @property
+    def ports_expired(self) -> bool:
+        """Return whether the status of the ports has to be read again."""
+        return self._ports_read_at == -inf
+
+    def expire_ports(self) -> None:
+        """Read the status of the ports again before it is used."""
+        self._ports_read_at = -inf
+
+    def on_info(self, info: Info) -> None:
+        """Process an info record: the readings before it are outdated."""
+        self.info_count += 1
+        self.expire_ports()
         if Change.CARD in info.changes:
             self._card_changed = True
             self.status_due = -inf
         now = asyncio.get_running_loop().time()
         for key in info.key_events:
-            if self._keys.take(now):
-                self.events.tell(key)
+            if self._key_limiter.take(now):
+                self.events.publish(key)
 
-    # -- Its clock -----------------------------------------------------------------
+    # -- Clock ---------------------------------------------------------------------
 
-    def clock_is_wrong(self, zone: tzinfo | None, now: float) -> bool:
-        """Return whether its clock is to be set; not all the time, if in vain."""
+    def must_set_clock(self, zone: tzinfo | None, now: float) -> bool:
+        """Return whether its clock is wrong and may be set again.
+
+        ``zone``: the zone it is kept in; ``None``: it is left alone. ``now``: loop
+        time, s.
+        """
         status = self.status
         if zone is None or status is None or now < self._clock_after:
             return False
@@ -354,8 +382,8 @@ class EwsBox:
         off = (self._local(zone) - status.clock).total_seconds()
         return abs(off) > CLOCK_TOLERANCE
 
-    def check_clock(self) -> None:
-        """Let its clock be set soon if it is wrong: it is to show another zone."""
+    def check_clock_soon(self) -> None:
+        """Check its clock with the next reading: it is kept in another zone now."""
         self._clock_after = -inf
 
     async def set_clock(self, turn: Turn, zone: tzinfo) -> None:
@@ -364,36 +392,10 @@ class EwsBox:
         Raises EwsRefusedError, and what `read` raises.
         """
         self._clock_after = turn.now + CLOCK_PAUSE
-        await self.tell(turn, CommandId.SET_CLOCK, lambda: set_clock(self._local(zone)))
+        await self.send_command(
+            turn, CommandId.SET_CLOCK, lambda: set_clock(self._local(zone))
+        )
         self.status_due = -inf
 
     def _local(self, zone: tzinfo) -> datetime:
         return self.clock().astimezone(zone).replace(tzinfo=None, microsecond=0)
-
-
-class Port(Protocol):
-    """A port, as the owner of its box knows it."""
-
-    box: EwsBox
-
-
-class Ports(ChargerGroup):
-    """The ports of one bus: they are of one box, which they share."""
-
-    def __init__(self) -> None:
-        """Begin with a box that is not known yet."""
-        self.box = EwsBox()
-
-    @override
-    def added(self, charger: Charger) -> None:
-        cast("Port", charger).box = self.box
-
-
-def _installation(system: SystemParameters, maximum: Pair[int | None]) -> Installation:
-    return Installation(
-        ports=system.ports,
-        mode=system.mode,
-        mode_1=system.mode_1,
-        fixed_cable=system.fixed_cable,
-        maximum=maximum,
-    )

@@ -1,121 +1,108 @@
-"""One port of an EWS-Box: what to ask, what to check, what to say again.
+"""One port of an EWS-Box: its regular exchange, and its orders.
 
-The box is read first, always, and must be the right one. The limit is said again
-whenever ``rd`` tells another one; a car that charges against the orders is paused; but
-nothing is ever started by itself. PROTOCOLS.md, 4; docs/ews-protocol.md.
+The box is always read first, and must be the right one. The limit is sent again
+whenever ``rd`` reports another one, and a car that charges against the orders is
+paused; but nothing is ever started without the user. PROTOCOLS.md, 4;
+docs/ews-protocol.md.
 """
 
-from contextlib import suppress
 from math import inf
 from typing import override
 
 from ..conversation import FollowUp, nothing, rest
-from ..errors import (
-    EvseError,
-    ImplausibleReplyError,
-    NotAvailableError,
-)
+from ..errors import EvseError, ImplausibleReplyError, NotAvailableError
 from ..exchange import Turn
 from ..framing import Frame
-from ..model import (
-    ChargerConfig,
-    Command,
-    OrderChange,
-    Orders,
-)
+from ..model import ChargerConfig, Command, Fault, OrderChange, Orders
 from ..safety import clamp
-from .box import EwsBox
 from .config import EwsPortConfig
-from .port_commands import conversation
+from .port_commands import PortCommands
 from .reader import EwsReader
 from .services import Services
-from .timing import (
-    FRESH,
-    INFO_PAUSE,
-    REASSERT_PAUSE,
-)
+from .timing import FRESH, INFO_PAUSE, REASSERT_PAUSE
 from .wire.frames import EwsFrame
 from .wire.info import decode_info
 
 
 class EwsPort(EwsReader):
-    """One port; all ports of a bus are of one box."""
+    """One port; all ports of a bus belong to one box."""
 
     def __init__(self, config: EwsPortConfig, orders: Orders) -> None:
-        """Take the set-up; the box is not known before it answers."""
+        """Take the configuration; the box is unknown before it answers."""
         super().__init__(config, orders)
         self.services = Services(self)
+        self._commands = PortCommands(self, self.permission)
+        self._reassert_after = -inf
         self._urgent_at = -inf
         self._urgent_waits = False
 
     @override
     def on_line_open(self) -> None:
         super().on_line_open()
+        self._reassert_after = -inf
         self._urgent_waits = False
 
     @override
     def reconfigure(self, config: ChargerConfig) -> None:
         zone = self.config.time_zone
-        # A lower limit does not wait because something else has failed just now.
+        # A lower limit is sent at once, whatever has failed just now.
         self._reassert_after = -inf
         super().reconfigure(config)
         if self.config.time_zone != zone:
-            self.box.check_clock()
+            self.box.check_clock_soon()
 
-    # -- The regular exchange ------------------------------------------------------
+    # -- The regular exchange ----------------------------------------------------------
 
     @override
     async def poll(self, turn: Turn) -> FollowUp | None:
         box = self.box
-        if not box.known or box.installation is None:
+        if not box.identified or box.installation is None:
             await self.ready(turn)
             self.hurry()
             return None
         try:
             await box.refresh(turn, turn.now - FRESH * self.config.poll_interval)
         except ImplausibleReplyError:
-            self.hold_back()
+            self.on_implausible()
             raise
-        self.take()
+        self.take_status()
         return self._next_action(turn.now)
 
-    # -- What must be so ---------------------------------------------------------------
+    # -- Maintenance -------------------------------------------------------------------
 
     def _next_action(self, now: float) -> FollowUp | None:
-        """Return what must be said because of a reading."""
+        """Return a conversation that the last readings require."""
         if self.busy:
             return None
-        self.limiter.check()
-        # A car that must not charge is never waited for.
-        if not self.permission.must_pause(self.setpoint) and (
-            now < self._reassert_after or not self._must_maintain(now)
-        ):
-            return None
-        return FollowUp(self._maintain)
+        must_pause = self.permission.must_pause(self.setpoint)
+        if not must_pause and not self.limiter.must_reassert():
+            self.notice(Fault.LIMIT_NOT_TAKEN, present=False)
+        # A car that must not charge is paused at once.
+        if must_pause or (now >= self._reassert_after and self._must_maintain(now)):
+            return FollowUp(self._maintain)
+        return None
 
     def _must_maintain(self, now: float) -> bool:
-        box = self.box
-        zone = self.config.time_zone
         return (
             self.limiter.must_reassert()
-            or now >= box.parameters_due
-            or box.clock_is_wrong(zone, now)
+            or now >= self.box.parameters_due
+            or self.box.must_set_clock(self.config.time_zone, now)
         )
 
     async def _maintain(self, turn: Turn) -> None:
         with self.conversing():
-            # Not again at once, whatever comes of it.
+            # After a failure, not again at once.
             self._reassert_after = turn.now + REASSERT_PAUSE
             await self._reassert(turn)
         self._reassert_after = -inf
 
     async def _reassert(self, turn: Turn) -> None:
         if self.permission.must_pause(self.setpoint):
-            ours = self.effective_orders.allowed is not False
-            await self.permission.pause(turn, for_current=ours)
+            allowed = self.effective_orders.allowed is not False
+            await self.permission.pause(turn, for_current=allowed)
             await rest(0.0)
         if self.limiter.must_reassert():
-            self.limiter.count()
+            self.limiter.count_reassertion()
             await self.limiter.enforce(turn, lambda: self.effective_orders)
             await rest(0.0)
         await self.ready(turn)
@@ -124,7 +111,7 @@ class EwsPort(EwsReader):
             await box.read_parameters(turn)
             await self.ready(turn)
         zone = self.config.time_zone
-        if zone is not None and box.clock_is_wrong(zone, turn.now):
+        if zone is not None and box.must_set_clock(zone, turn.now):
             await box.set_clock(turn, zone)
 
     # -- Orders ------------------------------------------------------------------------
@@ -133,23 +120,24 @@ class EwsPort(EwsReader):
     async def apply(self, turn: Turn, orders: Orders, change: OrderChange) -> None:
         with self.conversing():
             await self.ready(turn)
-            if clamp(self.order_to_send(change), self.limits).paused:
-                ours = self.order_to_send(change).allowed is not False
-                await self.permission.pause(turn, for_current=ours)
+            if self._is_pause(change):
+                allowed = self.order_to_send(change).allowed is not False
+                await self.permission.pause(turn, for_current=allowed)
                 self._check_possible(change)
                 return
             await self.limiter.enforce(turn, lambda: self.order_to_send(change))
             if not self.permission.may_start(change):
                 return
-
-            def still() -> bool:
-                # Not where a pause came meanwhile: that one is on its way.
-                return not clamp(self.order_to_send(change), self.limits).paused
-
             await rest(0.0)
             await self.permission.start(
-                turn, still, for_current=change.allowed is not True
+                turn,
+                # Not after a newer pause, which waits for its own turn.
+                lambda: not self._is_pause(change),
+                for_current=change.allowed is not True,
             )
+
+    def _is_pause(self, change: OrderChange) -> bool:
+        return clamp(self.order_to_send(change), self.limits).paused
 
     def _check_possible(self, change: OrderChange) -> None:
         """Raise NotAvailableError where charging was allowed, and can never begin.
@@ -168,13 +156,13 @@ class EwsPort(EwsReader):
     async def command(
         self, command: Command, value: bool | int | str | None = None
     ) -> None:
-        commanded = conversation(self, command, value)
-        if commanded is None:
+        conversation = self._commands.conversation(command, value)
+        if conversation is None:
             await super().command(command, value)
-            return
-        await self.run(commanded)
+        else:
+            await self.run(conversation)
 
-    # -- What it says unasked ------------------------------------------------------------
+    # -- Info records ------------------------------------------------------------------
 
     @override
     def on_unsolicited(self, frame: Frame) -> FollowUp | None:
@@ -186,43 +174,29 @@ class EwsPort(EwsReader):
             return None
         if info is None or self.bus is None:
             return None
-        # The first port that is asked hears it for both.
-        self.box.hear(info)
+        # The bus offers it to one port only, which processes it for the box.
+        self.box.on_info(info)
         if self._urgent_waits:
             return FollowUp(nothing)
         self._urgent_waits = True
         now = self.bus.now
         pause = max(0.0, self._urgent_at + INFO_PAUSE - now)
         self._urgent_at = now + pause
-        for other in self.bus.chargers.values():
-            if isinstance(other, EwsPort):
-                other.hurry(self._urgent_at)
-        return FollowUp(self._urgent, pause)
+        self.group.hurry(self._urgent_at)
+        return FollowUp(self._poll_out_of_turn, pause)
 
-    async def _urgent(self, turn: Turn) -> None:
-        """Poll out of turn."""
+    async def _poll_out_of_turn(self, turn: Turn) -> None:
         self._urgent_waits = False
         try:
             follow_up = await self.poll(turn)
         except EvseError:
             # The regular poll is due as well, and finds the same.
-            self.box.ports_at = -inf
+            self.box.expire_ports()
             raise
         self.on_reply(turn.now)
         self.plan(turn.now)
-        self._tell_others()
+        # The turn of the other port may be far away.
+        self.group.share_status(self)
         if follow_up is not None:
             await rest()
             await follow_up.conversation(turn)
-
-    def _tell_others(self) -> None:
-        """Let the other port take what the box told: its own turn may be far away."""
-        if self.bus is None or not self.box.known or not self.box.ports:
-            return
-        for other in self.bus.chargers.values():
-            if other is not self and isinstance(other, EwsPort) and other.available:
-                with suppress(EvseError):
-                    other.take()
-
-
-__all__ = ["EwsBox", "EwsPort"]

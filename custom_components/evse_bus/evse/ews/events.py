@@ -1,6 +1,6 @@
-"""What happens at an EWS-Box, as it happens: keys, cards, charges.
+"""Events of an EWS-Box: keys, cards, the begin and the end of charges.
 
-A reading says how things are; these say that something was done.
+A reading is a state; an event is reported once, when it happens.
 """
 
 from collections.abc import Callable
@@ -16,9 +16,9 @@ _LOGGER = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CardPresented:
-    """A card was held to the reader; that the box knows it is not said.
+    """A card was presented to the reader, whether or not it may charge.
 
-    Over Ethernet it calls every card valid (PROTOCOLS.md, 4).
+    Over Ethernet the box calls every card valid (PROTOCOLS.md, 4).
     """
 
     group: int = field(repr=False)
@@ -27,25 +27,25 @@ class CardPresented:
     user: str = field(repr=False)
     tag: bytes = field(repr=False)
     readable: bool
-    """The box could read what is on it; else only the tag means something."""
+    """The box could read the card; otherwise only the tag is valid."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StartRequested:
-    """Somebody wants to charge, and waits for our permission."""
+    """A start was requested at the box; it waits for permission."""
 
     port: int
     optimised: bool
-    """They want an optimised charge."""
+    """An optimised charge was requested."""
     group: int | None = field(default=None, repr=False)
-    """Of the card that is logged in at the port; ``None``: no card is."""
+    """Of the card that is logged in at the port; ``None``: no card."""
     number: int | None = field(default=None, repr=False)
     """Within its group."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChargeStarted:
-    """A charge has begun; a pause of ours or of the car is none's end."""
+    """A charge has begun. One that goes on after a pause has not."""
 
     port: int
 
@@ -56,31 +56,31 @@ class ChargeEnded:
 
     port: int
     result: ChargeResult | None
-    """Why; ``None``: not told, or by a code that the manual does not know."""
+    """Why it ended; ``None``: not reported, or a code that is not in the manual."""
     energy: int
     """Wh"""
     duration: int
-    """s, as the box counts it."""
+    """s, as counted by the box."""
 
 
 type Event = KeyEvent | CardPresented | StartRequested | ChargeStarted | ChargeEnded
-type Listener = Callable[[Event], None]
+type EventListener = Callable[[Event], None]
 
 
 class Events:
-    """Whoever wants to know."""
+    """Subscribers to the events of one box."""
 
     def __init__(self) -> None:
-        """Nobody yet."""
-        self._listeners: list[Listener] = []
+        """Start without subscribers."""
+        self._listeners: list[EventListener] = []
 
-    def subscribe(self, listener: Listener) -> Callable[[], None]:
-        """Call back for each event; return how to stop."""
+    def subscribe(self, listener: EventListener) -> Callable[[], None]:
+        """Call back for each event; return a function that ends it."""
         self._listeners.append(listener)
         return partial(self._listeners.remove, listener)
 
-    def tell(self, event: Event) -> None:
-        """Tell everybody; one that fails is logged and keeps nobody else waiting."""
+    def publish(self, event: Event) -> None:
+        """Call the subscribers; an error in one is logged and stops no other."""
         for listener in tuple(self._listeners):
             try:
                 listener(event)
@@ -88,37 +88,41 @@ class Events:
                 _LOGGER.exception("A listener failed")
 
 
-def start_requested(port: int, seen: PortStatus) -> StartRequested:
-    """Return that a start is asked for, by whoever is logged in there."""
-    card = seen.card
+def start_requested(port: int, status: PortStatus) -> StartRequested:
+    """Return the event of a start request, with the card that is logged in."""
+    card = status.card
     return StartRequested(
         port=port,
-        optimised=seen.optimised,
+        optimised=status.optimised,
         group=None if card is None else card.group,
         number=None if card is None else card.number,
     )
 
 
 def charge_ended(
-    port: int, running: PortStatus | None, seen: PortStatus
+    port: int, running: PortStatus | None, status: PortStatus
 ) -> ChargeEnded:
-    """Return that a charge has ended, by how the port was while it ran, and is now.
+    """Return the event of the end of a charge.
 
-    The manual does not say when the box takes a charge over as its last one, nor when
-    the counters of the charge under way begin anew (docs/ews-protocol.md).
+    ``running``: the last status while it was under way, ``status``: the first one
+    after it. The manual does not define when the box takes a charge over as its last
+    one, nor when the counters of the session are reset (docs/ews-protocol.md).
     """
-    time, energy = seen.last_time, seen.last_energy
+    time, energy = status.last_time, status.last_energy
     if running is not None and (time, energy) == (
         running.last_time,
         running.last_energy,
     ):
-        # Not taken over (yet), or one as long as the one before.
-        anew = seen.session_time < running.session_time
-        told = running if anew or seen.session_energy < running.session_energy else seen
-        time, energy = told.session_time, told.session_energy
-    return ChargeEnded(port=port, result=seen.result, energy=energy, duration=time)
+        # Not taken over (yet), or by chance equal to the charge before it.
+        was_reset = (
+            status.session_time < running.session_time
+            or status.session_energy < running.session_energy
+        )
+        counted = running if was_reset else status
+        time, energy = counted.session_time, counted.session_energy
+    return ChargeEnded(port=port, result=status.result, energy=energy, duration=time)
 
 
 def port_of(event: Event) -> int | None:
-    """Return the port at which something happened; ``None``: at the box."""
+    """Return the number of the port of an event; ``None``: an event of the box."""
     return None if isinstance(event, CardPresented) else event.port

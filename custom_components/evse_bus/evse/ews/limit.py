@@ -1,60 +1,59 @@
-"""The limit of a port: ``st`` until ``rd`` tells it, and whenever it tells another.
+"""The limit of one port: sent with ``st``, read back with ``rd``.
 
-The limit is lost when the box is switched off, and 0 takes it away: so what is said
-while charging is paused is the limit that counts when it goes on, and at least 6 A.
+The box loses its limit with the power, and 0 switches it off. So the limit sent while
+charging is paused is the one that counts when charging goes on, and at least 6 A.
 """
 
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from ..conversation import rest
 from ..errors import NotAvailableError, NotConfirmedError, ReplyTimeoutError
 from ..exchange import Turn
 from ..model import MINIMUM_CURRENT, CurrentLimit, Fault, Orders
 from ..safety import Setpoint, clamp
+from .port import BoxPort
 from .timing import LOOK_AGAIN, READY_PATIENCE, READY_PAUSE
 from .wire.answers import EwsRefusedError
 from .wire.commands import set_limit
 from .wire.frames import CommandId, Request
 from .wire.states import STARTING
 
-if TYPE_CHECKING:
-    from .reader import EwsReader
-
 SENDS: Final = 2
-"""How often a limit is said until it must be read back."""
-LOOKS: Final = 3
-"""How often it is looked for after each."""
+"""How often a limit is sent at most until it must be read back."""
+READS: Final = 3
+"""How often it is read back at most after each."""
 _LOWEST: Final = Orders(limit=CurrentLimit(current=MINIMUM_CURRENT))
 
 
 class Limiter:
-    """The limit of one port."""
+    """Makes the limit of one port what it should be."""
 
-    def __init__(self, port: EwsReader) -> None:
-        """Take the port."""
+    def __init__(self, port: BoxPort) -> None:
+        """Take the port to speak through."""
         self._port = port
         self._confirmed: int | None = None
-        """What was said and read back, or something lower, A."""
-        self._other: tuple[int, int] | None = None
-        """What was said, and what ``rd`` told and was taken for it, A."""
+        """The last limit that was sent, and read back at it or below it, A."""
+        self._read_instead: tuple[int, int] | None = None
+        """A limit, and the lower one that the box reports after it, A."""
 
     def forget(self) -> None:
-        """Note that the box may have forgotten its limit."""
-        self._confirmed = self._other = None
+        """Take note that the box may have lost its limit."""
+        self._confirmed = self._read_instead = None
 
-    # -- What is to be so ----------------------------------------------------------
+    # -- State -----------------------------------------------------------------------
 
-    def wanted(self, orders: Orders) -> Setpoint | None:
-        """Return what the limit is to be for these orders, paused or not.
+    def target(self, orders: Orders) -> Setpoint | None:
+        """Return the limit for these orders, paused or not.
 
-        ``None``: it cannot be said (no pilot in mode 1; not even 6 A are left).
+        ``None``: no limit can be sent (in mode 1 there is no control pilot; or not
+        even 6 A may be offered).
         """
         port = self._port
         installation = port.box.installation
-        if installation is None or installation.mode_1[port.port - 1]:
+        if installation is None or installation.mode_1[port.number - 1]:
             return None
         limits = port.limits
         for one in (replace(orders, allowed=None), _LOWEST):
@@ -64,139 +63,137 @@ class Limiter:
         return None
 
     @property
-    def told(self) -> int | None:
-        """Return the limit that ``rd`` told last, A; 0: none."""
+    def reported(self) -> int | None:
+        """Return the limit by the last ``rd``, A; 0: none is set."""
         details = self._port.box.details
-        return None if details is None else details.limit[self._port.port - 1]
-
-    def _is_taken(self, wanted: int) -> bool:
-        """Return whether the box offers no more than that, by what it told last."""
-        told, seen = self.told, self._port.seen
-        if told:
-            return told <= wanted
-        # Without a word of ours in it, what it offers must do.
-        offered = seen.offered_current if seen is not None else None
-        return told == 0 and bool(offered) and offered is not None and offered <= wanted
+        return None if details is None else details.limit[self._port.number - 1]
 
     def must_reassert(self) -> bool:
-        """Return whether the limit is to be said."""
-        setpoint = self.wanted(self._port.effective_orders)
-        told = self.told
-        if setpoint is None or told is None or self._port.seen is None:
+        """Return whether the limit has to be sent."""
+        setpoint = self.target(self._port.effective_orders)
+        reported = self.reported
+        if setpoint is None or reported is None or self._port.last_status is None:
             return False
-        wanted = int(setpoint.current)
-        if told == wanted:
+        target = int(setpoint.current)
+        if reported == target:
             return False
-        return self._other != (wanted, told) or not self._is_taken(wanted)
+        return self._read_instead != (target, reported) or not self._is_within(target)
 
-    def check(self) -> None:
-        """Take the fault away when all is well again."""
-        port = self._port
-        if self.must_reassert() or port.permission.must_pause(port.setpoint):
-            return
-        port.notice(Fault.LIMIT_NOT_TAKEN, present=False)
+    def _is_within(self, limit: int) -> bool:
+        """Return whether the box offers no more than that, by its last readings."""
+        reported, status = self.reported, self._port.last_status
+        if reported:
+            return reported <= limit
+        # It has no limit of ours: what it offers has to do.
+        offered = status.offered_current if status is not None else None
+        return reported == 0 and offered is not None and 0 < offered <= limit
 
-    def count(self) -> None:
-        """Count a limit that stood, and is said again because the box is above it."""
-        if self._confirmed is not None and not self._is_taken(self._confirmed):
+    def count_reassertion(self) -> None:
+        """Count it if the box has gone above a limit that it had followed."""
+        if self._confirmed is not None and not self._is_within(self._confirmed):
             self._port.statistics.reasserted += 1
 
-    # -- Saying it -----------------------------------------------------------------
+    # -- Conversation ----------------------------------------------------------------
 
     async def enforce(self, turn: Turn, orders: Callable[[], Orders]) -> None:
-        """Say the limit until it is read back, at it or below it.
+        """Send the limit until it is read back, at it or below it.
 
-        Raises NotConfirmedError when the box does not follow, EwsRefusedError when it
-        says so, and what `EwsReader.look` raises.
+        ``orders`` is called right before each request. Raises NotConfirmedError when
+        the box does not follow, EwsRefusedError, and what `BoxPort.read_status` raises.
         """
         port = self._port
         patience = turn.now + READY_PATIENCE
         sends = 0
         while sends < SENDS:
             await port.ready(turn)
-            # The cable counts as well, and is seen right now only.
-            seen = await port.look(turn)
-            if self.wanted(orders()) is None:
+            # The cable limits the current too, and is known right now only.
+            status = await port.read_status(turn)
+            if self.target(orders()) is None:
                 return
-            sends += 1
             try:
-                said, answered = await self._say(turn, orders)
+                sent, answered = await self._send(turn, orders)
             except EwsRefusedError:
-                if seen.status == STARTING and turn.now < patience:
-                    sends -= 1
+                if status.state == STARTING and turn.now < patience:
                     await rest(READY_PAUSE)
                     continue
                 await rest(0.0)
                 await self._after_refusal(turn)
                 raise
+            sends += 1
             await rest(0.0)
-            for _ in range(LOOKS):
-                await port.ready(turn)
-                if await self._is_read_back(turn, said, answered=answered):
-                    return
-                await rest(LOOK_AGAIN)
+            if await self._read_back(turn, sent, answered=answered):
+                return
         port.notice(Fault.LIMIT_NOT_TAKEN, present=True)
         message = f"{port.config.name} does not follow its limit"
         raise NotConfirmedError(message)
 
-    async def _say(self, turn: Turn, orders: Callable[[], Orders]) -> tuple[int, bool]:
-        """Say it; return what was said, A, and whether that was answered.
+    async def _send(self, turn: Turn, orders: Callable[[], Orders]) -> tuple[int, bool]:
+        """Send the limit; return it, A, and whether it was answered.
 
-        What was not may have been heard all the same.
+        Without a reply it may have been received all the same.
         """
         port = self._port
-        said: list[int] = []
+        sent: list[int] = []
 
         def request() -> Request:
-            setpoint = self.wanted(orders())
+            setpoint = self.target(orders())
             if setpoint is None:
                 message = f"{port.config.name}: no current may be offered"
                 raise NotAvailableError(message)
-            said.append(int(setpoint.current))
-            return set_limit(port.port, setpoint)
+            sent.append(int(setpoint.current))
+            return set_limit(port.number, setpoint)
 
-        self._confirmed = self._other = None
+        self.forget()
         try:
-            await port.box.tell(turn, CommandId.SET_LIMIT, request)
+            await port.box.send_command(turn, CommandId.SET_LIMIT, request)
         except ReplyTimeoutError:
-            return said[-1], False
-        return said[-1], True
+            return sent[-1], False
+        return sent[-1], True
 
-    async def _is_read_back(self, turn: Turn, said: int, *, answered: bool) -> bool:
-        """Return whether the box offers that, or less because it cannot offer more.
+    async def _read_back(self, turn: Turn, sent: int, *, answered: bool) -> bool:
+        """Read the limit back, a few times; return whether the box follows it."""
+        for _ in range(READS):
+            await self._port.ready(turn)
+            if await self._is_read_back(turn, sent, answered=answered):
+                return True
+            await rest(LOOK_AGAIN)
+        return False
 
-        A lower one after a lost answer is the one before: to be said again.
+    async def _is_read_back(self, turn: Turn, sent: int, *, answered: bool) -> bool:
+        """Read the limit back; return whether the box offers that, or less.
+
+        Less is what it can offer; but after a lost reply it may be the limit before.
         """
         port = self._port
         try:
-            await port.box.look(turn)
-            port.take()
-            await port.box.look_closer(turn)
+            await port.read_status(turn)
+            await port.box.read_details(turn)
         except ReplyTimeoutError:
             return False
-        port.take()
-        told = self.told
-        if told is None or not self._is_taken(said):
+        port.take_status()
+        reported = self.reported
+        if reported is None or not self._is_within(sent):
             return False
-        if not answered and told != said:
+        if not answered and reported != sent:
             return False
-        self._confirmed = said
-        self._other = (said, told)
+        self._confirmed = sent
+        self._read_instead = (sent, reported)
         port.notice(Fault.LIMIT_NOT_TAKEN, present=False)
         return True
 
     async def _after_refusal(self, turn: Turn) -> None:
-        """Leave a box that refused at no more than was ordered: at 6 A, if need be."""
+        """Leave a box that has refused its limit at no more than that, or at 6 A."""
         port = self._port
         await port.ready(turn)
-        wanted = self.wanted(port.effective_orders)
-        told = self.told
-        if wanted is None or told is None:
+        setpoint = self.target(port.effective_orders)
+        reported = self.reported
+        if setpoint is None or reported is None:
             return
-        if self._is_taken(int(wanted.current)):
-            # It has a lower maximum than it tells: said again, it would refuse again.
-            self._other = (int(wanted.current), told)
+        target = int(setpoint.current)
+        if self._is_within(target):
+            # Its maximum is lower than reported: sent again, it would refuse again.
+            self._read_instead = (target, reported)
             return
         port.notice(Fault.LIMIT_NOT_TAKEN, present=True)
         with suppress(EwsRefusedError):
-            await self._say(turn, lambda: _LOWEST)
+            await self._send(turn, lambda: _LOWEST)

@@ -1,13 +1,18 @@
-"""Letting a car charge or not: ``sl`` 6 and ``sl`` 3, each in its states only.
+"""Permission to charge: order ``sl`` 6 pauses a charge, order ``sl`` 3 starts one.
 
-A second 6 unlocks the cable, and a 3 in the wrong state starts whoever comes next. So
-each is sent right after an ``rc``, in the same turn of the bus; a 6 is not said again
-before the port had the time to follow; and after a lost answer the state decides.
+In the wrong state either does harm: a second 6 unlocks the cable, and a 3 without a
+waiting car starts the next one that comes. So each is sent right after an ``rc``, in
+the same turn, and only in its states (`states.RULES`); a 6 is repeated only after the
+port has had time to follow; and after a lost reply the next status decides.
+
+In its status, a pause of ours looks like one of the car or the end of a charge. Whose it
+is follows from what was sent and read since (`PauseTracker`).
 """
 
 from collections.abc import Callable
+from enum import Enum
 from math import inf
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from ..conversation import rest
 from ..errors import (
@@ -19,7 +24,7 @@ from ..errors import (
 from ..exchange import Turn
 from ..model import Fault, OrderChange
 from ..safety import Setpoint
-from .readings import RUNNING
+from .port import BoxPort
 from .timing import LOOK_AGAIN, READY_PATIENCE, READY_PAUSE, SETTLING
 from .wire.answers import EwsRefusedError, Refusal
 from .wire.commands import start_stop
@@ -32,6 +37,7 @@ from .wire.states import (
     CHARGING_OPTIMISED,
     ENDED,
     FREE,
+    RUNNING,
     SEARCHING,
     STARTING,
     WAITING,
@@ -39,281 +45,345 @@ from .wire.states import (
 )
 from .wire.status import PortStatus, StartRelease
 
-if TYPE_CHECKING:
-    from .reader import EwsReader
-
 SENDS: Final = 2
-"""How often one order is said at most in one conversation."""
-_CHARGING: Final = (CHARGING, CHARGING_OPTIMISED)
-_NOTHING_TO_START: Final = (FREE, SEARCHING, ENDED, ABORTED, BLOCKED)
-"""No car waits for a start: permission is given, and there is nothing to say."""
+"""Most repetitions of one order in one conversation, the first included."""
+_CHARGING: Final = frozenset({CHARGING, CHARGING_OPTIMISED})
+_NO_CAR_WAITS: Final = frozenset({FREE, SEARCHING, ENDED, ABORTED, BLOCKED})
+"""There is nothing to start: permission is given without an order."""
+
+
+class Pause(Enum):
+    """Whether the port is in a pause that we have ordered."""
+
+    NONE = "none"
+    POSSIBLE = "possible"
+    OURS = "ours"
+
+
+class PauseTracker:
+    """Follows whether a pause of ours stands at a port.
+
+    | What happens                                         | `pause` after it       |
+    | ---------------------------------------------------- | ---------------------- |
+    | We have just begun: an earlier run may have paused   | POSSIBLE               |
+    | Order 6 is sent                                      | POSSIBLE               |
+    | It is confirmed, or read to be followed              | OURS                   |
+    | It is refused                                        | NONE                   |
+    | A status that is no pause, or the plug was unlocked  | NONE                   |
+    | Order 3 is confirmed, or refused: the charge is over | NONE                   |
+    | A command stops the charge or unlocks the plug       | NONE                   |
+    | The session's counters go back; the box restarts     | POSSIBLE if it was OURS |
+    """
+
+    def __init__(self) -> None:
+        """Begin without knowledge of earlier runs; the stored orders do not help.
+
+        The order that led to a pause may have been replaced since.
+        """
+        self.pause = Pause.POSSIBLE
+        self.for_current = False
+        """It was for lack of current only: a higher limit ends it."""
+        self._sent_at = -inf
+        self._last: PortStatus | None = None
+        """The last status in which a pause of ours may have stood."""
+
+    @property
+    def was_sent(self) -> bool:
+        """Return whether order 6 was sent, and not taken back by order 3."""
+        return self._sent_at > -inf
+
+    def is_settling(self, now: float) -> bool:
+        """Return whether the port may not have followed order 6 yet."""
+        return now < self._sent_at + SETTLING
+
+    def on_sent(self, status: PortStatus, now: float) -> None:
+        """Take note that order 6 is sent, in this status."""
+        self.pause = Pause.POSSIBLE
+        self._sent_at = now
+        self._last = status
+
+    def on_started(self) -> None:
+        """Take note that order 3 was confirmed."""
+        self.pause = Pause.NONE
+        self._sent_at = -inf
+
+    def end(self) -> None:
+        """Take note that the pause is over, and that no limit brings it back."""
+        self.pause = Pause.NONE
+        self.for_current = False
+
+    def doubt(self) -> None:
+        """Take note that the pause may be over; no limit ends it any more."""
+        if self.pause is Pause.OURS:
+            self.pause = Pause.POSSIBLE
+        self.for_current = False
+
+    def on_status(self, status: PortStatus, now: float, *, has_lock: bool) -> None:
+        """Check whether the pause still stands; ``has_lock``: plugs are locked here."""
+        if self.pause is Pause.NONE:
+            # Its car goes on or has left: the next one was not paused by us.
+            self.for_current = False
+            return
+        before, self._last = self._last, status
+        is_over = _was_unlocked(before, status) or (has_lock and _has_left(status))
+        if status.state in AFTER_OUR_PAUSE and not is_over:
+            stands = True
+        else:
+            stands = status.state in _CHARGING and self.is_settling(now)
+        if not stands:
+            self.end()
+        elif _counters_went_back(before, status):
+            # Another charge; or a box whose counters begin anew with a pause, where a
+            # second order 6 would unlock.
+            self.doubt()
+
+
+def _was_unlocked(before: PortStatus | None, status: PortStatus) -> bool:
+    return before is not None and bool(before.locked) and status.locked is False
+
+
+def _has_left(status: PortStatus) -> bool:
+    return status.state == ENDED and status.locked is False
+
+
+def _counters_went_back(before: PortStatus | None, status: PortStatus) -> bool:
+    return before is not None and (
+        status.session_time < before.session_time
+        or status.session_energy < before.session_energy
+    )
 
 
 class Permission:
-    """What a port has been allowed, as far as it is our doing."""
+    """The permission of one port: pauses a charge, and starts one."""
 
-    def __init__(self, port: EwsReader) -> None:
-        """Take the port; what an earlier run of ours has paused nobody knows."""
+    def __init__(self, port: BoxPort) -> None:
+        """Take the port to speak through."""
         self._port = port
-        # The orders do not tell: what has paused it may be gone from them.
-        self.paused: bool | None = None
-        """We have paused this charge; ``None``: perhaps (an answer was lost, or it was
-        before our time)."""
-        self.waits_for_current = False
-        """Our own 0 A has paused it: a higher limit lets it go on."""
-        self._said_at = -inf
+        self._tracker = PauseTracker()
         self._started_at = -inf
-        self._was_locked = False
-        self._energy = 0
-        self._time = 0
+
+    # -- State -----------------------------------------------------------------------
+
+    @property
+    def pause_state(self) -> Pause:
+        """Return whether a pause of ours stands."""
+        return self._tracker.pause
+
+    @property
+    def waits_for_current(self) -> bool:
+        """Return whether our own limit of 0 A has paused it: a higher one ends it."""
+        return self._tracker.for_current
+
+    def on_status(self, status: PortStatus) -> None:
+        """Check by a status whether our pause still stands."""
+        installation = self._port.box.installation
+        has_lock = installation is not None and installation.fixed_cable is False
+        self._tracker.on_status(status, self._port.now, has_lock=has_lock)
 
     def forget(self) -> None:
-        """Note that no pause of ours stands any more: stopped or unlocked."""
-        self.paused = False
-        self.waits_for_current = False
+        """Take note that a command has stopped the charge or unlocked the plug."""
+        self._tracker.end()
 
     def doubt(self) -> None:
-        """Note that a pause of ours stands perhaps, and gives nothing back any more."""
-        if self.paused:
-            self.paused = None
-        self.waits_for_current = False
+        """Take note that the box has restarted: our pause may be over."""
+        self._tracker.doubt()
 
-    # -- What is known -------------------------------------------------------------
+    def is_paused(self, status: PortStatus) -> bool | None:
+        """Return whether the port is in our pause; ``None``: it may be."""
+        if self._tracker.pause is Pause.POSSIBLE:
+            return None
+        return self._tracker.pause is Pause.OURS and status.state in AFTER_OUR_PAUSE
 
-    def watch(self, seen: PortStatus) -> None:
-        """See whether our pause still stands."""
-        if self.paused is False:
-            # It goes on, or somebody has ended it: whoever comes next did not wait.
-            self.waits_for_current = False
-            return
-        other = seen.session_time < self._time or seen.session_energy < self._energy
-        self._time, self._energy = seen.session_time, seen.session_energy
-        unlocked = self._was_locked and seen.locked is False
-        self._was_locked = bool(seen.locked)
-        unlocked |= self._is_free(seen)
-        still = seen.status in AFTER_OUR_PAUSE and not unlocked
-        # Said a moment ago: it may not have followed yet.
-        still |= seen.status in _CHARGING and self._is_settling()
-        if not still:
-            self.paused = False
-            self._was_locked = False
-            self.waits_for_current = False
-        elif other:
-            # Another charge, or counters that begin anew with a pause: a 6 that is
-            # said again would unlock.
-            self.doubt()
+    def is_session(self, status: PortStatus, *, before: bool) -> bool:
+        """Return whether a charge is under way, pauses of ours included.
 
-    def _is_free(self, seen: PortStatus) -> bool:
-        """Return whether a charge has ended with its plug free: no pause of ours."""
-        known = self._port.box.installation
-        has_lock = known is not None and known.fixed_cable is False
-        return has_lock and seen.status == ENDED and seen.locked is False
-
-    def _is_settling(self) -> bool:
-        bus = self._port.bus
-        return bus is not None and bus.now < self._said_at + SETTLING
-
-    def is_paused(self, seen: PortStatus) -> bool:
-        """Return whether the port stands in our pause."""
-        return self.paused is True and seen.status in AFTER_OUR_PAUSE
-
-    def is_session(self, seen: PortStatus, *, was: bool) -> bool:
-        """Return whether a charge is under way; in our pause it still is.
-
-        ``was``: it was when we looked last.
+        ``before``: whether it was by the status before this one.
         """
-        if seen.status in RUNNING or self.is_paused(seen):
+        if status.state in RUNNING or self.is_paused(status):
             return True
-        bus = self._port.bus
-        resumes = bus is not None and bus.now < self._started_at + SETTLING
-        return (
-            was and seen.status in AFTER_OUR_PAUSE and (self.paused is None or resumes)
-        )
+        is_starting = self._port.now < self._started_at + SETTLING
+        may_go_on = self._tracker.pause is Pause.POSSIBLE or is_starting
+        return before and status.state in AFTER_OUR_PAUSE and may_go_on
 
     def must_pause(self, setpoint: Setpoint) -> bool:
-        """Return whether a car charges, or may at any moment, that must not."""
-        seen = self._port.seen
-        return setpoint.paused and seen is not None and self._runs(seen)
-
-    def _runs(self, seen: PortStatus) -> bool:
-        """Return whether order 6 would pause a charge here, and not unlock.
-
-        In 0x42 and 0x43 that is only known where it is no pause of ours.
-        """
-        if seen.status in _CHARGING:
-            return True
-        return seen.status in RUNNING and self.paused is False
-
-    # -- Pausing -------------------------------------------------------------------
-
-    async def pause(self, turn: Turn, *, for_current: bool) -> None:
-        """Stop a charge under way, and keep the cable locked.
-
-        ``for_current``: only our limit of 0 A wants so. Raises NotConfirmedError when
-        it goes on, EwsRefusedError when the box says no, and what `EwsReader.look` raises.
-        """
-        port = self._port
-        sends = 0
-        if not for_current:
-            self.waits_for_current = False
-        while True:
-            await port.ready(turn)
-            seen = await port.look_now(turn)
-            if not self._runs(seen):
-                break
-            if turn.now >= self._said_at + SETTLING:
-                if sends == SENDS:
-                    port.notice(Fault.LIMIT_NOT_TAKEN, present=True)
-                    message = f"{port.config.name} does not pause"
-                    raise NotConfirmedError(message)
-                sends += 1
-                await self._say_pause(turn, seen)
-            await rest(LOOK_AGAIN)
-        if sends and self.paused is None and seen.status in AFTER_OUR_PAUSE:
-            # The answer was lost, and it has followed.
-            self.paused = True
-        if for_current and self.paused is not False and self._said_at > -inf:
-            self.waits_for_current = seen.status in AFTER_OUR_PAUSE
-
-    async def _say_pause(self, turn: Turn, seen: PortStatus) -> None:
-        port = self._port
-        changes = port.box.changes
-
-        def request() -> Request:
-            if port.box.changes != changes:
-                message = f"{port.config.name}: something happens there right now"
-                raise SupersededError(message)
-            self._said_at = turn.now
-            # Until the answer nobody knows.
-            self.paused = None
-            self._time, self._energy = seen.session_time, seen.session_energy
-            self._was_locked = bool(seen.locked)
-            return start_stop(port.port, StartStop.PAUSE, seen)
-
-        try:
-            await port.box.tell(turn, CommandId.START_STOP, request)
-        except SupersededError:
-            return
-        except ReplyTimeoutError:
-            # Perhaps it was heard: the next look tells.
-            return
-        except EwsRefusedError:
-            self.paused = False
-            port.notice(Fault.LIMIT_NOT_TAKEN, present=True)
-            raise
-        self.paused = True
-
-    # -- Starting ------------------------------------------------------------------
+        """Return whether a car charges, or may at any moment, against the orders."""
+        status = self._port.last_status
+        return setpoint.paused and status is not None and self._can_pause(status)
 
     def may_start(self, change: OrderChange) -> bool:
-        """Return whether a start is to be said: nobody's change of a limit does.
+        """Return whether a change of the orders may start a car.
 
-        The user's word does, and a limit gives back what only a limit of 0 A took.
+        The user's permission may. A limit may only end the pause that a limit of 0 A
+        has begun.
         """
         if change.allowed is True:
             return True
-        asked = change.current is not None or any(
+        sets_limit = change.current is not None or any(
             phase is not None for phase in change.phases
         )
-        return asked and self.waits_for_current
+        return sets_limit and self.waits_for_current
+
+    def _can_pause(self, status: PortStatus) -> bool:
+        """Return whether order 6 would pause a charge here, and not unlock.
+
+        A paused one (0x42, 0x43) only where the pause is the car's for certain.
+        """
+        if status.state in _CHARGING:
+            return True
+        return status.state in RUNNING and self._tracker.pause is Pause.NONE
+
+    async def _read_status(self, turn: Turn) -> PortStatus:
+        await self._port.ready(turn)
+        return await self._port.read_fresh_status(turn)
+
+    # -- Pausing ---------------------------------------------------------------------
+
+    async def pause(self, turn: Turn, *, for_current: bool) -> None:
+        """Pause a charge under way; its cable stays locked.
+
+        ``for_current``: charging is allowed, and only the limit of 0 A demands it.
+        Raises NotConfirmedError when the charge goes on, EwsRefusedError, and what
+        `BoxPort.read_status` raises.
+        """
+        tracker = self._tracker
+        if not for_current:
+            tracker.for_current = False
+        sends = 0
+        status = await self._read_status(turn)
+        while self._can_pause(status):
+            if not tracker.is_settling(turn.now):
+                if sends == SENDS:
+                    self._port.notice(Fault.LIMIT_NOT_TAKEN, present=True)
+                    message = f"{self._port.config.name} does not pause"
+                    raise NotConfirmedError(message)
+                sends += 1
+                await self._send_pause(turn, status)
+            await rest(LOOK_AGAIN)
+            status = await self._read_status(turn)
+        has_followed = status.state in AFTER_OUR_PAUSE
+        if sends and has_followed and tracker.pause is Pause.POSSIBLE:
+            # The reply was lost, but not the order.
+            tracker.pause = Pause.OURS
+        if for_current and tracker.was_sent and tracker.pause is not Pause.NONE:
+            tracker.for_current = has_followed
+
+    async def _send_pause(self, turn: Turn, status: PortStatus) -> None:
+        """Send order 6; a lost reply or a newer status leave it to the next status."""
+        port, tracker = self._port, self._tracker
+
+        def request() -> Request:
+            tracker.on_sent(status, turn.now)
+            return start_stop(port.number, StartStop.PAUSE, status)
+
+        try:
+            confirmed = await port.send_order(turn, request)
+        except SupersededError:
+            return
+        except EwsRefusedError:
+            tracker.pause = Pause.NONE
+            port.notice(Fault.LIMIT_NOT_TAKEN, present=True)
+            raise
+        if confirmed:
+            tracker.pause = Pause.OURS
+
+    # -- Starting --------------------------------------------------------------------
 
     async def start(
-        self, turn: Turn, still: Callable[[], bool], *, for_current: bool
+        self, turn: Turn, is_wanted: Callable[[], bool], *, for_current: bool
     ) -> None:
-        """Let the car charge that waits, or that we have paused.
+        """Start the car that waits, or end our pause; without either, do nothing.
 
-        Where there is nothing to start, nothing is said. ``still`` is asked right
-        before each word. ``for_current``: only a limit wants so, for the car that a
-        limit has stopped and no other. Raises NotAvailableError in a state in which
-        nothing can be started, NotConfirmedError when it does not start or is aborted
-        at once, EwsRefusedError, SupersededError, and what `EwsReader.look` raises.
+        ``is_wanted`` is called right before each order. ``for_current``: only a limit
+        demands it, for the car that a limit has paused. Raises NotAvailableError in a
+        state in which nothing can be started, NotConfirmedError when the charge does
+        not start or is aborted at once, EwsRefusedError, SupersededError, and what
+        `BoxPort.read_status` raises.
         """
-        port = self._port
         patience = turn.now + READY_PATIENCE
-        said_at: float | None = None
+        sent_at: float | None = None
         sends = 0
         while True:
-            await port.ready(turn)
-            seen = await port.look_now(turn)
-            settled = said_at is None or turn.now >= said_at + SETTLING
-            if self._has_started(seen, settled=settled):
+            status = await self._read_status(turn)
+            settled = sent_at is None or turn.now >= sent_at + SETTLING
+            if self._has_started(status, settled=settled):
                 break
-            if seen.status == STARTING:
-                self._check_patience(turn, patience)
-                await rest(READY_PAUSE)
-                continue
-            if not settled:
+            if status.state == STARTING:
+                await self._wait_for_boot(turn, patience)
+            elif not settled:
                 await rest(LOOK_AGAIN)
-                continue
-            if sends == SENDS:
-                message = f"{port.config.name} does not start"
+            elif sends == SENDS:
+                message = f"{self._port.config.name} does not start"
                 raise NotConfirmedError(message)
-            if self._nobody_waits(seen, said=sends > 0, for_current=for_current):
+            elif self._is_needless(status, sent=sends > 0, for_current=for_current):
                 break
-            said_at, done = await self._say_start(turn, seen, still)
-            if done is None:
-                self._check_patience(turn, patience)
-                said_at = None
-                await rest(READY_PAUSE)
-                continue
-            sends += 1
-            await rest(LOOK_AGAIN)
-        self.waits_for_current = False
+            elif await self._send_start(turn, status, is_wanted):
+                sent_at = turn.now
+                sends += 1
+                await rest(LOOK_AGAIN)
+            else:
+                sent_at = None
+                await self._wait_for_boot(turn, patience)
+        self._tracker.for_current = False
 
-    def _check_patience(self, turn: Turn, until: float) -> None:
-        if turn.now >= until:
-            message = f"{self._port.config.name} is still starting up"
-            raise NotAvailableError(message)
+    def _has_started(self, status: PortStatus, *, settled: bool) -> bool:
+        tracker = self._tracker
+        if status.state in _CHARGING and not tracker.is_settling(self._port.now):
+            return True
+        if status.state in RUNNING and tracker.pause is Pause.NONE:
+            return True
+        # Released: the plug is locked, then the car has to begin.
+        released = status.start is StartRelease.RELEASED
+        return settled and released and status.state == WAITING
 
-    def _nobody_waits(self, seen: PortStatus, *, said: bool, for_current: bool) -> bool:
+    def _is_needless(
+        self, status: PortStatus, *, sent: bool, for_current: bool
+    ) -> bool:
         """Return whether there is nothing to start.
 
-        Raises NotConfirmedError where the box has aborted what was ``said`` to start.
+        ``sent``: order 3 was sent. Raises NotConfirmedError where the box has aborted
+        the charge since.
         """
-        if said and seen.status == ABORTED:
+        if sent and status.state == ABORTED:
             message = f"{self._port.config.name}: the box has aborted the charge"
             raise NotConfirmedError(message)
         if for_current and not self.waits_for_current:
             return True
-        return seen.status in _NOTHING_TO_START and not self._goes_on(seen)
+        may_be_paused = (
+            self._tracker.pause is not Pause.NONE and status.state in AFTER_OUR_PAUSE
+        )
+        return status.state in _NO_CAR_WAITS and not may_be_paused
 
-    def _goes_on(self, seen: PortStatus) -> bool:
-        """Return whether a charge stands here that we have paused, perhaps."""
-        return self.paused is not False and seen.status in AFTER_OUR_PAUSE
+    async def _wait_for_boot(self, turn: Turn, until: float) -> None:
+        if turn.now >= until:
+            message = f"{self._port.config.name} is still starting up"
+            raise NotAvailableError(message)
+        await rest(READY_PAUSE)
 
-    def _has_started(self, seen: PortStatus, *, settled: bool) -> bool:
-        if seen.status in _CHARGING and not self._is_settling():
-            return True
-        if seen.status in RUNNING and self.paused is False:
-            return True
-        # Released: it locks the plug, and then waits for the car.
-        released = seen.start is StartRelease.RELEASED
-        return settled and released and seen.status == WAITING
+    async def _send_start(
+        self, turn: Turn, status: PortStatus, is_wanted: Callable[[], bool]
+    ) -> bool:
+        """Send order 3; return False where the box is not ready for it yet.
 
-    async def _say_start(
-        self, turn: Turn, seen: PortStatus, still: Callable[[], bool]
-    ) -> tuple[float, bool | None]:
-        """Say it; return when, and whether it was taken (``None``: not ready yet)."""
-        port = self._port
+        A lost reply leaves it to the next status.
+        """
+        port, tracker = self._port, self._tracker
 
         def request() -> Request:
-            if not still():
+            if not is_wanted():
                 raise SupersededError("a newer command came first")
-            paused = self.paused is not False
-            return start_stop(port.port, StartStop.START, seen, paused=paused)
+            paused = tracker.pause is not Pause.NONE
+            return start_stop(port.number, StartStop.START, status, paused=paused)
 
         try:
-            await port.box.tell(turn, CommandId.START_STOP, request)
+            await port.box.send_command(turn, CommandId.START_STOP, request)
         except ReplyTimeoutError:
-            return turn.now, False
+            return True
         except EwsRefusedError as error:
             if error.reason is Refusal.NOT_READY:
-                return turn.now, None
+                return False
             if error.reason is Refusal.WAITING_FOR_UNPLUG:
-                self.paused = False
-                self.waits_for_current = False
+                tracker.end()
             raise
-        self.paused = False
-        self._said_at = -inf
+        tracker.on_started()
         self._started_at = turn.now
-        return turn.now, True
+        return True

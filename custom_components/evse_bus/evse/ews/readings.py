@@ -1,4 +1,4 @@
-"""What is made of what an EWS-Box tells: one charger's reading for each port.
+"""From the records of an EWS-Box to capabilities, limits and the reading of a port.
 
 Pure functions. Manual, 3.2.4 (``rc``, ``rd``, ``rs``).
 """
@@ -8,13 +8,12 @@ from typing import Final
 
 from ..model import MINIMUM_CURRENT, Capability, Limits, SessionResult
 from ..readings import ChargerInfo, ChargerReading, ConnectorReading
-from .box import Installation, Told
+from .box import Installation, Snapshot
 from .wire.box_status import BoxStatus
 from .wire.parameters import SystemMode
 from .wire.states import (
     AFTER_OUR_PAUSE,
-    CHARGING,
-    PAUSED_OPTIMISED,
+    RUNNING,
     WAITING,
     box_faults,
     port_state,
@@ -22,9 +21,7 @@ from .wire.states import (
 from .wire.status import ChargeResult, PortFlags, PortStatus, StartRelease
 
 MODE_1_CURRENT: Final = 16
-"""What a household socket carries, A: all or nothing (2.2.1)."""
-RUNNING: Final = range(CHARGING, PAUSED_OPTIMISED + 1)
-"""Status bytes of a charge under way, pauses included."""
+"""Current of a household socket, A: all or nothing (2.2.1)."""
 
 _MODE_3_ONLY: Final = frozenset(
     {
@@ -58,11 +55,11 @@ _ALL: Final = _MODE_3_ONLY | {
 def capabilities_of(
     port: int, installation: Installation | None
 ) -> frozenset[Capability]:
-    """Return what a port has; mode 1 has no pilot, a fixed cable no lock.
+    """Return the capabilities of a port; mode 1 has no pilot, a fixed cable no lock.
 
-    Cards are there unless the box says that it asks for none; its keys are told only
-    where they are the server's to watch (3.2.3). What its parameters may take away is
-    left out before they are known: what was shown once would stay.
+    There are cards unless the box is set to ask for none; keys are reported only where
+    the server has them (3.2.3). Before the parameters are known, capabilities that
+    depend on them are left out: entities that were created once would stay.
     """
     if installation is None:
         return _ALL - _MODE_3_ONLY - {Capability.CARDS}
@@ -84,31 +81,31 @@ def limits_of(
     own: float,
     box: BoxStatus | None,
     installation: Installation | None,
-    seen: PortStatus | None,
+    status: PortStatus | None,
 ) -> Limits:
-    """Return what no order may exceed; ``own``: the user's limit for the port, A.
+    """Return the limits of a port; ``own``: the user's limit for it, A.
 
     The smallest of jumper (``rs``), parameter (``rp``, ``rz``) and cable (``rc``).
     """
     if installation is None or box is None or not box.maximum_current:
         return Limits(installation=own, reports_maximum=True, step=1.0)
-    told = min(box.maximum_current, installation.maximum[port - 1] or inf)
+    reported = min(box.maximum_current, installation.maximum[port - 1] or inf)
     minimum = MINIMUM_CURRENT
     if installation.mode_1[port - 1]:
-        told = minimum = MODE_1_CURRENT
-    elif not installation.fixed_cable and seen is not None and seen.cable_current:
-        told = min(told, seen.cable_current)
+        reported = minimum = MODE_1_CURRENT
+    elif not installation.fixed_cable and status is not None and status.cable_current:
+        reported = min(reported, status.cable_current)
     return Limits(
         installation=own,
         reports_maximum=True,
-        reported=float(told),
+        reported=float(reported),
         minimum=float(minimum),
         step=1.0,
     )
 
 
 def charger_info(box: BoxStatus) -> ChargerInfo:
-    """Return what the box is."""
+    """Return manufacturer, model, serial number and versions of a box."""
     return ChargerInfo(
         manufacturer="P-CHARGE",
         model="EWS-Box",
@@ -121,47 +118,47 @@ def charger_info(box: BoxStatus) -> ChargerInfo:
     )
 
 
-def charger_reading(port: int, box: Told, *, paused: bool | None) -> ChargerReading:
-    """Return a port's reading; ``paused``: it is our pause that it is in, or may be.
+def charger_reading(port: int, box: Snapshot, *, paused: bool | None) -> ChargerReading:
+    """Return the reading of a port; its connector has the number of the port.
 
-    Its connector has the number of the port: both are parts of one box.
+    ``paused``: it is in a pause of ours; ``None``: it may be.
     """
     at = port - 1
-    seen, details, installation = box.ports[at], box.details, box.installation
+    status, details, installation = box.ports[at], box.details, box.installation
     fixed = installation.fixed_cable
-    state = port_state(seen, fixed_cable=fixed, paused=paused is True)
+    state = port_state(status, fixed_cable=fixed, paused=paused is True)
     connector = ConnectorReading(
         status=state.status,
         raw_state=state.raw,
         plugged=state.plugged,
         charging=state.charging,
         power=float(details.power[at]),
-        energy=float(seen.total_energy),
-        session_energy=float(seen.session_energy),
-        session_time=seen.session_time,
-        last_session_energy=float(seen.last_energy),
-        last_session_time=seen.last_time,
-        last_result=_result(seen.result),
+        energy=float(status.total_energy),
+        session_energy=float(status.session_energy),
+        session_time=status.session_time,
+        last_session_energy=float(status.last_energy),
+        last_session_time=status.last_time,
+        last_result=_result(status.result),
         last_end=details.last_end[at],
-        user=(seen.card.user or None) if seen.card is not None else None,
-        cable_current=float(seen.cable_current) if seen.cable_current else None,
+        user=(status.card.user or None) if status.card is not None else None,
+        cable_current=float(status.cable_current) if status.cable_current else None,
         locked=state.locked,
-        contactor=seen.contactor,
-        optimised=seen.optimised,
-        start_requested=asks_for_start(seen),
-        rcd_tripped=seen.rcd_tripped,
-        ventilation_requested=PortFlags.VENTILATION in seen.flags,
-        pilot_low=seen.pwm_minimum,
-        pilot_high=seen.pwm_maximum,
-        proximity_voltage=seen.cable_voltage,
+        contactor=status.contactor,
+        optimised=status.optimised,
+        start_requested=asks_for_start(status),
+        rcd_tripped=status.rcd_tripped,
+        ventilation_requested=PortFlags.VENTILATION in status.flags,
+        pilot_low=status.pwm_minimum,
+        pilot_high=status.pwm_maximum,
+        proximity_voltage=status.cable_voltage,
     )
-    offered = 0 if paused else seen.offered_current
-    told = limits_of(port, inf, box.status, installation, None).reported
+    offered = 0 if paused else status.offered_current
+    maximum = limits_of(port, inf, box.status, installation, None).reported
     return ChargerReading(
         connectors={port: connector},
-        allowed=_allowed(seen, paused=paused),
+        allowed=_allowed(status, paused=paused),
         offered_current=None if offered is None else float(offered),
-        maximum_current=told,
+        maximum_current=maximum,
         server_connected=box.status.server_connected,
         ventilating=box.status.ventilating,
         faults=state.faults | box_faults(box.status),
@@ -170,37 +167,37 @@ def charger_reading(port: int, box: Told, *, paused: bool | None) -> ChargerRead
             "pwm_duty": details.pwm_duty[at],
             "pilot_code": details.pilot_code[at],
             "cable_code": details.cable_code[at],
-            "start_code": seen.start_code,
-            "result_code": seen.result_code,
-            "meter_cycles": seen.meter_cycles,
+            "start_code": status.start_code,
+            "result_code": status.result_code,
+            "meter_cycles": status.meter_cycles,
         },
     )
 
 
-def asks_for_start(seen: PortStatus) -> bool:
-    """Return whether somebody waits for our permission.
+def asks_for_start(status: PortStatus) -> bool:
+    """Return whether a car waits for permission to start.
 
-    A start may be asked for while the box still looks for the car. A permission would
-    start nobody then, and be forgotten: so the car that waits is what asks.
+    A start may be requested while the box still searches for the car. Permission given
+    then starts nothing and is lost, so that is no request yet.
     """
-    return seen.start is StartRelease.REQUESTED and seen.status == WAITING
+    return status.start is StartRelease.REQUESTED and status.state == WAITING
 
 
-def _result(told: ChargeResult | None) -> SessionResult | None:
-    return None if told is None else SessionResult[told.name]
+def _result(result: ChargeResult | None) -> SessionResult | None:
+    return None if result is None else SessionResult[result.name]
 
 
-def _allowed(seen: PortStatus, *, paused: bool | None) -> bool | None:
-    """Return whether a car may charge, as the box says it; ``None``: it does not.
+def _allowed(status: PortStatus, *, paused: bool | None) -> bool | None:
+    """Return whether a car may charge; ``None``: the status does not show it.
 
-    The same word of the box is for a pause of the car and for one of ours.
+    In the status, a pause of the car and one of ours look the same.
     """
     if paused:
         return False
-    if paused is None and seen.status in AFTER_OUR_PAUSE:
+    if paused is None and status.state in AFTER_OUR_PAUSE:
         return None
-    if seen.status in RUNNING:
+    if status.state in RUNNING:
         return True
-    if seen.status == WAITING:
-        return seen.start is StartRelease.RELEASED
+    if status.state == WAITING:
+        return status.start is StartRelease.RELEASED
     return None

@@ -1,12 +1,13 @@
-"""Looking for an EWS-Box on a bus; nothing is written.
+"""Search for an EWS-Box on a bus; nothing is written.
 
-There is one box on a line: it is found by its serial number, whichever ports it has.
-``id`` is asked under both readings of the checksum (manual, 3.2.2).
+A line has one box, which is found by its serial number, with the ports it has. ``id``
+is sent with either checksum (manual, 3.2.2).
 """
 
 from math import inf
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from ..bus import Bus
 from ..errors import (
     ExchangeRefusedError,
     GarbledReplyError,
@@ -15,22 +16,19 @@ from ..errors import (
     ReplyTimeoutError,
 )
 from ..model import ChargerConfig, Orders
+from ..protocol import Progress
 from ..scan import FoundCharger, ScanResult
 from .box import EwsBox
 from .readings import charger_info, limits_of
 
-if TYPE_CHECKING:
-    from ..bus import Bus
-    from ..protocol import Progress
-
 TRIES: Final = 4
-"""How often a silent line is asked, under one reading and the other in turn."""
+"""How often ``id`` is sent to a silent line, with either checksum in turn."""
 
 
 async def scan(
     bus: Bus, config: ChargerConfig, orders: Orders, progress: Progress
 ) -> ScanResult:
-    """Look for a box; ``config`` and ``orders`` are not needed.
+    """Search for a box; ``config`` and ``orders`` are not needed.
 
     Raises LineLostError when the port is lost meanwhile.
     """
@@ -40,19 +38,19 @@ async def scan(
     progress(0.0)
     for attempt in range(TRIES):
         try:
-            await bus.run(box.meet)
+            await bus.run(box.identify)
         except GarbledReplyError:
             unreadable += 1
         except ReplyTimeoutError, LineBusyError:
             pass
         except ImplausibleReplyError, ExchangeRefusedError:
-            # It speaks as a box does, and is none that we understand.
+            # It replies as a box does, but not as one of a known kind.
             unreadable += 1
-        if box.known and box.installation is not None:
+        if box.identified and box.installation is not None:
             progress(1.0)
             return ScanResult(found=_found(box))
         progress((attempt + 1) / TRIES)
-    # A box is silent under the reading of the checksum that is not its own.
+    # A box does not answer to the checksum that is not its own.
     return ScanResult(unreadable=unreadable >= TRIES // 2)
 
 

@@ -1,18 +1,20 @@
-"""What an EWS-Box can do beside charging: cards, meter, LEDs, clock, parameters.
+"""Services of an EWS-Box beside charging: cards, meter, LEDs, clock, parameters.
 
-All of it belongs to the box; any of its ports may carry it out. Nothing is logged: the
-blocks have names, cards and passwords in them.
+All but the meter belong to the box, and any of its ports carries them out. Nothing is
+logged: the data contain names, cards and passwords.
 """
 
 from collections.abc import Awaitable, Callable, Mapping
 from datetime import tzinfo
-from typing import TYPE_CHECKING, Final
+from math import inf
+from typing import Final
 
 from ..conversation import rest
 from ..errors import NotConfirmedError, RefusedOrderError, ReplyTimeoutError
 from ..exchange import Turn
+from .port import BoxPort
 from .timing import LOOK_AGAIN
-from .wire.answers import decode_card_reader
+from .wire.answers import confirmed, decode_card_reader
 from .wire.box_status import Dhcp, decode_dhcp
 from .wire.cards import (
     AcceptedCard,
@@ -32,57 +34,49 @@ from .wire.commands import (
 from .wire.frames import CommandId, Request
 from .wire.parameters import Block, Shown
 
-if TYPE_CHECKING:
-    from .reader import EwsReader
-
-LOOKS: Final = 5
-"""How often something written is read back until it must stand there."""
+READS: Final = 5
+"""How often written data are read back at most."""
 LONGEST_READER_TIMEOUT: Final = 10
-"""The box must hear the next command in time, s."""
+"""Longest time-out of the card reader, s: the box needs its next command in time."""
 
 
 class Services:
-    """The services of one box, carried out in the turns of one of its ports."""
+    """The services of one box, carried out in the turns of one of its ports.
 
-    def __init__(self, port: EwsReader) -> None:
-        """Take the port."""
+    Beside what is documented, each raises RefusedOrderError for an impossible value,
+    EwsRefusedError, NotConfirmedError for a lost reply, and what `Charger.run` raises.
+    """
+
+    def __init__(self, port: BoxPort) -> None:
+        """Take the port to speak through."""
         self._port = port
 
     # -- Cards ---------------------------------------------------------------------
 
     async def accept_card(self, card: AcceptedCard) -> None:
-        """Accept a card that the box does not know, or log somebody in (``ma``).
-
-        Raises RefusedOrderError, EwsRefusedError, NotConfirmedError (a lost answer),
-        and what `Charger.run` raises; so do all others here.
-        """
-        request = accept_card(card)
-        await self.in_a_turn(
-            lambda turn: self._port.box.tell(
-                turn, CommandId.ACCEPT_CARD, lambda: request
-            )
-        )
+        """Accept a card that is not in the box's list, or log a user in (``ma``)."""
+        await self.send(accept_card(card))
 
     async def read_cards(self) -> CardList:
         """Return the box's own list of cards (``rf``)."""
-        return await self.in_a_turn(self._read_cards)
+        return await self._run(self._read_cards)
 
     async def write_cards(self, changes: Mapping[int, CardEntry]) -> CardList:
         """Replace some entries (0 to 63), and nothing else; return the list (``sf``).
 
-        Raises NotConfirmedError when the list is not read back so.
+        Raises NotConfirmedError when another list is read back.
         """
-        wanted: list[CardList] = []
+        written: list[CardList] = []
 
         async def write(turn: Turn) -> None:
             cards = (await self._read_cards(turn)).with_entries(changes)
-            wanted.append(cards)
-            await self._tell(turn, CommandId.WRITE_CARDS, write_cards(cards))
+            written.append(cards)
+            await self._write(turn, write_cards(cards))
 
         return await self._write_and_read(
             write,
             self._read_cards,
-            lambda cards: cards == wanted[-1],
+            lambda cards: cards == written[-1],
             lambda: "its card list",
         )
 
@@ -92,7 +86,7 @@ class Services:
     async def card_reader(
         self, target: ReaderTarget, patience: int, data: bytes
     ) -> bytes:
-        """Hand a command to the card reader; return its answer (``mc``).
+        """Pass a command on to the card reader; return its reply (``mc``).
 
         ``patience``: the reader's time-out, up to 10 s.
         """
@@ -100,16 +94,7 @@ class Services:
             message = f"a time-out of {patience} s is not 0 to {LONGEST_READER_TIMEOUT}"
             raise RefusedOrderError(message)
         request = card_reader(target, patience, data)
-        return await self.in_a_turn(
-            lambda turn: self._port.box.ask(
-                turn,
-                CommandId.CARD_READER,
-                lambda: request,
-                decode_card_reader,
-                patience=patience,
-            ),
-            patience=patience,
-        )
+        return await self._exchange(request, decode_card_reader, patience=patience)
 
     # -- Meter, LEDs, clock, network -------------------------------------------------
 
@@ -119,37 +104,34 @@ class Services:
         Raises NotAvailableError for a port that the box does not have.
         """
         port = self._port
-        request = set_meter(port.port, total)
+        request = set_meter(port.number, total)
 
         async def write(turn: Turn) -> None:
-            await port.look(turn)
-            await port.box.tell(turn, CommandId.SET_METER, lambda: request)
+            await port.read_status(turn)
+            await port.box.send_command(turn, CommandId.SET_METER, lambda: request)
 
-        await self.in_a_turn(write)
+        await self._run(write)
         port.hurry()
 
     async def set_leds(self, first: PortLeds, second: PortLeds) -> None:
         """Set the LEDs of both ports; only a box with manual keys and LEDs (``se``)."""
-        request = set_leds(first, second)
-        await self.in_a_turn(
-            lambda turn: self._port.box.tell(turn, CommandId.SET_LEDS, lambda: request)
-        )
+        await self.send(set_leds(first, second))
 
     async def set_clock(self, zone: tzinfo) -> None:
         """Set the clock to the time in this zone, however wrong it is (``sc``)."""
-        await self.in_a_turn(lambda turn: self._port.box.set_clock(turn, zone))
+        await self._run(lambda turn: self._port.box.set_clock(turn, zone))
 
     async def read_dhcp(self) -> Dhcp:
-        """Return what DHCP gave the box (``rg``)."""
-        return await self.in_a_turn(
+        """Return the network settings that the box got by DHCP (``rg``)."""
+        return await self._run(
             lambda turn: self._port.box.read(turn, CommandId.READ_DHCP, decode_dhcp)
         )
 
     # -- Parameters ------------------------------------------------------------------
 
     async def read_parameters[T](self, block: Block[T]) -> T:
-        """Return a block of parameters (``rp ru ri rz``); passwords are in it."""
-        return await self.in_a_turn(
+        """Return a block of parameters, with its passwords (``rp ru ri rz``)."""
+        return await self._run(
             lambda turn: self._port.box.read(turn, block.read, block.decode)
         )
 
@@ -160,53 +142,69 @@ class Services:
     ) -> T:
         """Change fields of a block, and nothing else; return it (``sp su si sz``).
 
-        It is read, changed and written in one turn, then read back. ``changes`` may
-        be made of what stands there, for single bits of a field. Raises
-        HiddenSecretError where a password would be erased that the box hides,
-        NotConfirmedError when a field is not read back so (over the network a box
-        keeps its server mode), or when a secret that the box hides got no answer.
+        It is read, changed and written in one turn, then read back. ``changes`` may be
+        a function of the block as it was read, to change single bits of a field.
+        Raises HiddenSecretError where a password would be erased that the box hides,
+        and NotConfirmedError when a field is read back with another value (over the
+        network a box keeps its server mode), or when a secret that the box hides was
+        not confirmed by a reply.
         """
         box = self._port.box
-        wanted: dict[str, object] = {}
+        written: dict[str, object] = {}
         answered = False
 
         async def write(turn: Turn) -> None:
             nonlocal answered
             raw = await box.read(turn, block.read, bytes)
-            wanted.update(
+            written.update(
                 changes if isinstance(changes, Mapping) else changes(block.decode(raw))
             )
-            answered = await self._tell(turn, block.write, block.change(raw, wanted))
+            answered = await self._write(turn, block.change(raw, written))
 
-        def stands(told: T) -> bool:
-            secrets = block.secrets_told(told)
+        def is_written(found: T) -> bool:
+            secrets = block.shown_secrets(found)
             return all(
-                # What is hidden has only the answer for a witness.
+                # A hidden secret is confirmed by the reply to the write alone.
                 (answered and secrets.get(name, Shown.SHOWN) is not Shown.SHOWN)
-                or getattr(told, name) == _as_read(value)
-                for name, value in wanted.items()
+                or getattr(found, name) == _as_read(value)
+                for name, value in written.items()
             )
 
         try:
             return await self._write_and_read(
                 write,
                 lambda turn: box.read(turn, block.read, block.decode),
-                stands,
-                lambda: ", ".join(sorted(wanted)),
+                is_written,
+                lambda: ", ".join(sorted(written)),
             )
         finally:
-            # Also where not all of it was taken: some of it may stand there.
-            box.parameters_due = float("-inf")
+            # Also after a failure: some fields may have been written.
+            box.parameters_due = -inf
 
-    # -- Turns -----------------------------------------------------------------------
+    # -- Conversations -----------------------------------------------------------------
 
-    async def in_a_turn[T](
+    async def send(self, request: Request, *, patience: float = 0.0) -> None:
+        """Send a command that is confirmed by one byte; return when it was OK.
+
+        ``patience``: additional time for the reply, s.
+        """
+        decode = confirmed(request.command)
+        await self._exchange(request, decode, patience=patience)
+
+    async def _exchange[T](
+        self, request: Request, decode: Callable[[bytes], T], *, patience: float = 0.0
+    ) -> T:
+        return await self._run(
+            lambda turn: self._port.box.exchange(
+                turn, request.command, lambda: request, decode, patience=patience
+            ),
+            patience=patience,
+        )
+
+    async def _run[T](
         self, work: Callable[[Turn], Awaitable[T]], *, patience: float = 0.0
     ) -> T:
-        """Do something in one turn of the bus, the box being known.
-
-        ``patience``: longer than a reply usually takes, s.
-        """
+        """Have a conversation with the box, once it is identified."""
         port = self._port
 
         async def conversation(turn: Turn) -> T:
@@ -222,17 +220,16 @@ class Services:
 
     def _worst_case(self, patience: float) -> float | None:
         bus = self._port.bus
-        if bus is None or not patience:
-            return None
-        return bus.worst_case(self._port) + patience
+        return None if bus is None else bus.worst_case(self._port) + patience
 
-    async def _tell(self, turn: Turn, command: CommandId, request: Request) -> bool:
+    async def _write(self, turn: Turn, request: Request) -> bool:
         """Write; return whether it was answered.
 
-        A lost answer decides nothing, what is read back does.
+        A lost reply decides nothing: the data read back do.
         """
+        box = self._port.box
         try:
-            await self._port.box.tell(turn, command, lambda: request)
+            await box.send_command(turn, request.command, lambda: request)
         except ReplyTimeoutError:
             return False
         return True
@@ -241,28 +238,29 @@ class Services:
         self,
         write: Callable[[Turn], Awaitable[None]],
         read: Callable[[Turn], Awaitable[T]],
-        stands: Callable[[T], bool],
-        what: Callable[[], str],
+        is_written: Callable[[T], bool],
+        name: Callable[[], str],
     ) -> T:
-        """Write in one turn, then read until it stands there.
+        """Write in one turn, then read until the data are right; return them.
 
-        Raises NotConfirmedError when it does not.
+        ``name``: of the data, for the message. Raises NotConfirmedError when they
+        stay wrong.
         """
         port = self._port
 
         async def conversation(turn: Turn) -> T:
             await port.ready(turn)
             await write(turn)
-            for _ in range(LOOKS):
+            for _ in range(READS):
                 await rest(LOOK_AGAIN)
                 await port.ready(turn)
                 try:
                     found = await read(turn)
                 except ReplyTimeoutError:
                     continue
-                if stands(found):
+                if is_written(found):
                     return found
-            message = f"{port.config.name} did not take {what()}"
+            message = f"{port.config.name} did not take {name()}"
             raise NotConfirmedError(message)
 
         return await port.run(conversation)

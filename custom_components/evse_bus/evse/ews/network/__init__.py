@@ -1,1 +1,1 @@
-"""EWS-Boxes that dial: the listener, and the line of each box."""
+"""Boxes that dial over the network: the listener, and the line of each box."""

@@ -1,7 +1,7 @@
-"""A line that a box has opened: the box is the client and dials us (manual, 3.1.4.2).
+"""A line that is opened by the box: it is the client and dials us (manual, 3.1.4.2).
 
-There is no authentication in this protocol: whoever connects may be anybody, and is
-given little time, few bytes and no trust. Nothing that passes is logged.
+The protocol has no authentication: any device may connect. So its time and bytes are
+limited, and no data are logged.
 """
 
 import asyncio
@@ -20,26 +20,26 @@ _LOGGER = logging.getLogger(__name__)
 type Address = IPv4Address | IPv6Address
 
 ANSWER_PATIENCE: Final = 15.0
-"""Commands that stay without an answer for so long end a connection, s."""
+"""A connection ends when commands are left unanswered for so long, s."""
 MOST_NOISE: Final = LONGEST_FRAME
-"""Bytes that belong to no message, between two answers: more end a connection."""
+"""Most bytes of no message between two replies; more end a connection."""
 MOST_BYTES: Final = 8 * LONGEST_FRAME
-"""Bytes of any kind between two answers: more end a connection."""
+"""Most bytes of any kind between two replies; more end a connection."""
 _PIECE: Final = 256
-"""So many bytes are looked at before they are counted."""
+"""So many bytes are searched for messages before they are counted."""
 
 
 class Connection(asyncio.Protocol):
-    """One accepted connection; its bytes go to a line, or wait for one."""
+    """One accepted connection; its bytes go to a line, or are kept for one."""
 
     def __init__(
         self,
-        made: Callable[[Connection], None],
-        gone: Callable[[Connection], None],
+        on_made: Callable[[Connection], None],
+        on_gone: Callable[[Connection], None],
     ) -> None:
-        """Call ``made`` when the connection stands, and ``gone`` when it has ended."""
-        self._made = made
-        self._gone = gone
+        """Call ``on_made`` once it is open, and ``on_gone`` once it has ended."""
+        self._on_made = on_made
+        self._on_gone = on_gone
         self._transport: asyncio.Transport | None = None
         self._waiting = b""
         self.line: AcceptedLine | None = None
@@ -47,7 +47,7 @@ class Connection(asyncio.Protocol):
 
     @property
     def is_open(self) -> bool:
-        """Return whether it stands."""
+        """Return whether it is open."""
         return self._transport is not None
 
     @override
@@ -56,7 +56,7 @@ class Connection(asyncio.Protocol):
             raise TypeError(type(transport).__name__)
         self._transport = transport
         self.peer = _address(transport.get_extra_info("peername"))
-        self._made(self)
+        self._on_made(self)
 
     @override
     def data_received(self, data: bytes) -> None:
@@ -72,23 +72,23 @@ class Connection(asyncio.Protocol):
         self._ended(exc)
 
     def keep(self, data: bytes) -> None:
-        """Let bytes wait for the line that comes next."""
+        """Keep bytes for the next line."""
         self._waiting = (self._waiting + data)[-MOST_BYTES:]
 
     def hand_over(self) -> None:
-        """Give the line what has come before it."""
+        """Give the line the bytes that were kept."""
         waiting, self._waiting = self._waiting, b""
         if self.line is not None and waiting:
             self.line.received(waiting)
 
     def write(self, data: bytes) -> None:
-        """Send bytes; LineLostError when it has ended."""
+        """Send bytes; raises LineLostError when it has ended."""
         if self._transport is None or self._transport.is_closing():
             raise LineLostError("the connection was closed")
         self._transport.write(data)
 
     def close(self) -> None:
-        """End it; what still waits to be sent is not waited for."""
+        """End it, without waiting for bytes not sent yet."""
         transport = self._transport
         if transport is None:
             return
@@ -99,7 +99,7 @@ class Connection(asyncio.Protocol):
             transport.close()
 
     def abort(self) -> None:
-        """End it without a word."""
+        """End it at once."""
         transport = self._transport
         if transport is not None:
             self._ended(None)
@@ -113,7 +113,7 @@ class Connection(asyncio.Protocol):
         line, self.line = self.line, None
         if line is not None:
             line.lost(error)
-        self._gone(self)
+        self._on_gone(self)
 
 
 def _address(peer: object) -> Address | None:
@@ -124,16 +124,16 @@ def _address(peer: object) -> Address | None:
 
 
 class AcceptedLine(Line):
-    """The line of one box, whichever connection it has now.
+    """The line of one box, over all of its connections.
 
-    It has no open of its own: the listener brings the connection (`attach`), and a bus
-    that is told to look again finds it open.
+    It cannot be opened from here: the listener attaches a connection (`attach`), which
+    the next `open` begins with.
     """
 
     opened_by_peer: ClassVar = True
 
     def __init__(self, name: str, noise: Callable[[], int]) -> None:
-        """Take what counts the bytes that belong to no message."""
+        """``noise`` returns the bytes received that belong to no message."""
         super().__init__(name, SETTINGS)
         self.echoes = False
         self._noise = noise
@@ -149,20 +149,15 @@ class AcceptedLine(Line):
     def is_open(self) -> bool:
         return self._connection is not None
 
-    @property
-    def waits(self) -> bool:
-        """Return whether a connection waits for `open`."""
-        return self._next is not None and self._next.is_open
-
     def attach(self, connection: Connection) -> None:
-        """Let this be the next connection; an older one that still waits is ended."""
+        """Use this connection with the next `open`; one that still waits is ended."""
         if self._next is not None:
             self._next.abort()
         self._next = connection
 
     @override
     async def open(self) -> None:
-        """Begin with the connection that waits; PortMissingError: there is none."""
+        """Use the connection that waits; raises PortMissingError without one."""
         connection, self._next = self._next, None
         if connection is None or not connection.is_open:
             message = f"{self.url} has not connected"
@@ -173,11 +168,11 @@ class AcceptedLine(Line):
         self._note_progress()
         loop = asyncio.get_running_loop()
         self.last_activity = loop.time()
-        # Whoever opens gets ready first; then what has come so far.
+        # The caller gets ready first, then come the bytes received so far.
         loop.call_soon(connection.hand_over)
 
     def release(self) -> None:
-        """Let the connection go, for another line."""
+        """Give the connection up, for another line."""
         self._connection = None
         self._stop_watch()
 
@@ -205,9 +200,9 @@ class AcceptedLine(Line):
         return self.last_activity
 
     def received(self, data: bytes) -> None:
-        """Take bytes of the connection; too many that answer nothing end it."""
-        # Much may come at once, and looking for messages in all of it takes long:
-        # garbage is looked at only until it is known to be too much.
+        """Take bytes of the connection; too many without a reply end it."""
+        # Searching for messages takes long: of a lot of garbage only as much is
+        # searched as it takes to know that it is too much.
         for at in range(0, len(data), _PIECE):
             if self._connection is None:
                 return
@@ -236,7 +231,7 @@ class AcceptedLine(Line):
     async def answers(self, patience: float) -> bool:
         """Return whether the connection answers a command within this time, s.
 
-        Somebody else asks: the bus, which is to be told that it is urgent.
+        The command is the bus's, which has to be asked to poll at once.
         """
         if self._connection is None:
             return False
@@ -250,13 +245,13 @@ class AcceptedLine(Line):
             self._proof = None
 
     def end(self, why: str) -> None:
-        """End the connection; the bus notices as with an adapter that is unplugged."""
+        """End the connection; for the bus it is a port that was unplugged."""
         if self._connection is not None:
             _LOGGER.debug("%s: connection ended: %s", self.url, why)
             self._connection.abort()
 
     def lost(self, error: Exception | None) -> None:
-        """Take note that the connection has ended."""
+        """Take note that the connection has ended; ``error``: why, if not by us."""
         if self._connection is None:
             return
         self._connection = None

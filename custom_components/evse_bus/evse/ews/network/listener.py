@@ -1,16 +1,17 @@
-"""The server that EWS-Boxes dial: who is there, and which bus is theirs.
+"""The server that EWS-Boxes dial: it identifies them, and gives each to its bus.
 
-A box is asked ``id`` and ``rs``, and nothing else before its serial number is one that
-is set up; then it belongs to the bus of that number. Nothing here can tell a box from
-somebody who gives its number (the protocol has no authentication), so a number that is
-connected and answers keeps its connection, and addresses can be restricted.
+A box is asked for ``id`` and ``rs``, and for nothing else before its serial number is
+known to be a registered one; then it belongs to the bus of that number. The protocol
+has no authentication: nothing here can tell a box from another device that gives its
+number. So a connection that answers keeps its number, and addresses can be restricted.
 """
 
 import asyncio
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 import errno
+from functools import partial
 from ipaddress import IPv4Network, IPv6Network
 import logging
 from math import inf
@@ -23,8 +24,8 @@ from ...framing import Frame
 from ...line import line_error
 from ...statistics import ChargerStatistics
 from ...throttle import LOSSES, LOSSES_WINDOW, RateLimiter
-from ..box import EwsBox, Ports
-from ..charger import EwsPort
+from ..box import EwsBox
+from ..port import BoxPorts
 from ..timing import TCP_TIMING
 from ..wire.frames import EwsFrame, EwsFramer, MessageId
 from .line import AcceptedLine, Address, Connection
@@ -34,27 +35,28 @@ _LOGGER = logging.getLogger(__name__)
 type Network = IPv4Network | IPv6Network
 
 IDENTIFY_TIME: Final = 10.0
-"""Longest time to say who one is, s."""
+"""Longest time for a connection to be identified, s."""
 MOST_UNIDENTIFIED: Final = 16
-"""Connections that have not said yet who they are, at once, beside one for each box
-that is set up: after a power cut all of them dial in the same moment."""
+"""Most unidentified connections at once, beside one for each registered box: after a
+power failure all of them dial in the same moment."""
 GRACE: Final = 1.0
-"""One of those that is older may have to go for a newer one, s."""
-MOST_STRANGERS: Final = 8
-"""Connections of boxes that are not set up, at once."""
-STRANGER_TIME: Final = 40.0
-"""Such a connection is kept for so long, s: hung up on, it would dial all the time."""
+"""An unidentified connection that is older may be dropped for a newer one, s."""
+MOST_UNKNOWN: Final = 8
+"""Most connections of unknown boxes at once."""
+UNKNOWN_TIME: Final = 40.0
+"""An unknown box is kept connected for so long, s: dropped, it would dial again at
+once."""
 PROOF_TIME: Final = 10.0
-"""Longest time for a connected box to show that it is still there, s."""
+"""Longest time for a connected box to answer when another gives its number, s."""
 PROOF_PAUSE: Final = 1.0
-"""Shortest time between two such questions to one box, s."""
+"""Shortest time between two such requests to one box, s."""
 _MAPPED: Final = 96
-"""Length of what stands before an address of IPv4 that is written as one of IPv6."""
+"""Length of the prefix of an IPv4 address in the form of an IPv6 one, bits."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Stranger:
-    """A box that has dialled and is not set up."""
+class UnknownBox:
+    """A box that has dialled and is not registered."""
 
     serial: str
     firmware: str
@@ -63,20 +65,30 @@ class Stranger:
 
 @dataclass(slots=True)
 class ListenerStatistics:
-    """What became of those who dialled."""
+    """Numbers of connections, by what became of them."""
 
     accepted: int = 0
     not_allowed: int = 0
     """From an address that may not connect."""
     crowded_out: int = 0
-    """One too many that had not said who they are."""
+    """Dropped: too many unidentified connections."""
     unidentified: int = 0
-    """Did not say who they are, or not in time."""
-    strangers: int = 0
-    seconds: int = 0
-    """Gave the number of a box that is connected and answers."""
+    """Dropped: not identified, or not in time."""
+    unknown: int = 0
+    """Of boxes that are not registered."""
+    duplicates: int = 0
+    """Dropped: gave the number of a box that is connected and answers."""
     replaced: int = 0
-    """Took the place of a connection that did not answer any more."""
+    """Took the place of a connection that no longer answered."""
+
+
+@dataclass(slots=True, eq=False)
+class _RegisteredBox:
+    """A box with a bus of its own."""
+
+    bus: Bus
+    line: AcceptedLine
+    ports: BoxPorts
 
 
 class Listener:
@@ -88,30 +100,33 @@ class Listener:
         port: int,
         *,
         allowed: Iterable[Network] = (),
-        on_stranger: Callable[[Stranger], None] = lambda _stranger: None,
+        on_unknown_box: Callable[[UnknownBox], None] = lambda _box: None,
     ) -> None:
-        """Listen at an address; port 0: any that is free (see `port`).
+        """Take the address; port 0: any free one (see `port`).
 
-        ``allowed``: networks that may connect; none: all may. ``on_stranger`` is
-        called each time that a box dials which is not set up.
+        ``allowed``: networks that may connect; none: all may. ``on_unknown_box`` is
+        called each time an unregistered box dials.
         """
         self.host = host
         self.port = port
         self.allowed = tuple(map(_plain, allowed))
-        self.on_stranger = on_stranger
+        self.on_unknown_box = on_unknown_box
         self.statistics = ListenerStatistics()
         self._server: asyncio.Server | None = None
-        self._buses: dict[str, Bus] = {}
+        self._registered: dict[str, _RegisteredBox] = {}
         self._unidentified: dict[Connection, float] = {}
-        self._identified: dict[Connection, Stranger] = {}
-        """All others that are open, whatever became of them."""
-        self._strangers: dict[str, Connection] = {}
+        """Open connections, and the loop times at which they were accepted."""
+        self._identified: dict[Connection, UnknownBox] = {}
+        """All other open connections."""
+        self._unknown: dict[str, Connection] = {}
+        """Those of unknown boxes."""
         self._bound: dict[str, Connection] = {}
-        """Those that belong to the bus of a box."""
+        """Those that belong to the bus of a registered box."""
         self._timers: dict[Connection, asyncio.TimerHandle] = {}
         self._tasks: set[asyncio.Task[None]] = set()
-        self._asking: set[str] = set()
-        self._asked_at: dict[str, float] = {}
+        self._proving: set[str] = set()
+        """Boxes that are asked whether they still answer."""
+        self._proved_at: dict[str, float] = {}
         self._warned: set[str] = set()
         self._warnings = RateLimiter(LOSSES, LOSSES_WINDOW)
 
@@ -125,8 +140,8 @@ class Listener:
     async def start(self) -> None:
         """Begin to listen.
 
-        Raises PortBusyError for a port that is taken, PortMissingError for an address
-        that is not ours, PortPermissionError, or LineError.
+        Raises PortBusyError for a port in use, PortMissingError for an address that is
+        not of this host, PortPermissionError, or LineError.
         """
         if self._server is not None:
             return
@@ -142,7 +157,7 @@ class Listener:
         self.port = self._server.sockets[0].getsockname()[1]
 
     async def stop(self) -> None:
-        """Listen no more; buses keep their connections until they are stopped."""
+        """Stop listening; buses keep their connections until they are stopped."""
         server, self._server = self._server, None
         if server is not None:
             server.close()
@@ -159,7 +174,7 @@ class Listener:
     def allow(self, networks: Iterable[Network]) -> None:
         """Let only these networks connect from now on; none: all may.
 
-        Connections from elsewhere end at once, also those of boxes that are set up.
+        Connections from elsewhere end at once, also those of registered boxes.
         """
         self.allowed = tuple(map(_plain, networks))
         for connection in (*self._unidentified, *self._identified):
@@ -167,57 +182,40 @@ class Listener:
                 self.statistics.not_allowed += 1
                 connection.abort()
 
-    # -- Boxes that are set up -------------------------------------------------------
+    # -- Registered boxes ------------------------------------------------------------
 
-    def expect(self, serial: str, name: str = "") -> Bus:
+    def register(self, serial: str, name: str = "") -> Bus:
         """Return the bus of a box; it waits until the box dials.
 
-        Put ports on it and start it. One that has dialled already as a stranger
-        begins at once. ``name`` is what the log calls it.
+        The caller adds the ports and starts it. An unknown box of this number that is
+        connected already is used at once. ``name`` is for log messages.
         """
-        if (known := self._buses.get(serial)) is not None:
-            return known
+        if (known := self._registered.get(serial)) is not None:
+            return known.bus
         framer = EwsFramer()
         line = AcceptedLine(name or f"EWS-Box {serial}", lambda: framer.noise)
-        bus = self._buses[serial] = Bus(line, framer, TCP_TIMING, name, group=Ports())
-        if (stranger := self._strangers.pop(serial, None)) is not None:
-            self._keep_for_good(stranger)
-            self._bound[serial] = stranger
-            line.attach(stranger)
+        # Otherwise it would keep out the box whose number it gave when it dialled.
+        ports = BoxPorts(on_wrong_box=partial(line.end, "another box answers"))
+        bus = Bus(line, framer, TCP_TIMING, name, group=ports)
+        self._registered[serial] = _RegisteredBox(bus, line, ports)
+        if (connection := self._unknown.pop(serial, None)) is not None:
+            self._cancel_timer(connection)
+            self._bound[serial] = connection
+            line.attach(connection)
         return bus
 
-    async def forget(self, serial: str) -> None:
-        """Let a box be a stranger from now on; its bus is stopped."""
-        bus = self._buses.pop(serial, None)
-        if bus is not None:
-            await bus.stop()
-
-    # -- Who is there ----------------------------------------------------------------
+    async def unregister(self, serial: str) -> None:
+        """Stop the bus of a box; the box is an unknown one from now on."""
+        box = self._registered.pop(serial, None)
+        if box is not None:
+            await box.bus.stop()
 
     @property
-    def strangers(self) -> tuple[Stranger, ...]:
-        """Return the boxes that are connected now and not set up."""
-        return tuple(self._identified[one] for one in self._strangers.values())
+    def unknown_boxes(self) -> tuple[UnknownBox, ...]:
+        """Return the boxes that are connected now and not registered."""
+        return tuple(self._identified[one] for one in self._unknown.values())
 
-    @property
-    def peers(self) -> Mapping[str, Address | None]:
-        """Return from where the boxes that are set up are connected now, by number."""
-        return {serial: one.peer for serial, one in self._bound.items()}
-
-    def _on_gone(self, connection: Connection) -> None:
-        self._unidentified.pop(connection, None)
-        self._keep_for_good(connection)
-        known = self._identified.pop(connection, None)
-        if known is None:
-            return
-        for table in (self._strangers, self._bound):
-            if table.get(known.serial) is connection:
-                del table[known.serial]
-
-    def _keep_for_good(self, connection: Connection) -> None:
-        """Stop the timer that would end a connection."""
-        if (timer := self._timers.pop(connection, None)) is not None:
-            timer.cancel()
+    # -- Connections -----------------------------------------------------------------
 
     def _on_connection(self, connection: Connection) -> None:
         if self._server is None or not self._is_allowed(connection.peer):
@@ -230,9 +228,23 @@ class Listener:
             return
         self.statistics.accepted += 1
         self._unidentified[connection] = asyncio.get_running_loop().time()
-        task = asyncio.create_task(self._welcome(connection), name="EWS-Box dials")
+        task = asyncio.create_task(self._identify(connection), name="EWS-Box dials")
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
+
+    def _on_gone(self, connection: Connection) -> None:
+        self._unidentified.pop(connection, None)
+        self._cancel_timer(connection)
+        known = self._identified.pop(connection, None)
+        if known is None:
+            return
+        for table in (self._unknown, self._bound):
+            if table.get(known.serial) is connection:
+                del table[known.serial]
+
+    def _cancel_timer(self, connection: Connection) -> None:
+        if (timer := self._timers.pop(connection, None)) is not None:
+            timer.cancel()
 
     def _is_allowed(self, peer: Address | None) -> bool:
         if not self.allowed:
@@ -240,8 +252,8 @@ class Listener:
         return peer is not None and any(peer in network for network in self.allowed)
 
     def _has_room(self) -> bool:
-        """Return whether one more may say who he is; the slowest goes for him."""
-        if len(self._unidentified) < MOST_UNIDENTIFIED + len(self._buses):
+        """Return whether one more may be identified; the oldest is dropped for it."""
+        if len(self._unidentified) < MOST_UNIDENTIFIED + len(self._registered):
             return True
         oldest, since = next(iter(self._unidentified.items()))
         if asyncio.get_running_loop().time() - since < GRACE:
@@ -250,141 +262,136 @@ class Listener:
         oldest.abort()
         return True
 
-    async def _welcome(self, connection: Connection) -> None:
+    async def _identify(self, connection: Connection) -> None:
+        """Find out which box has dialled, and give the connection to its bus."""
         try:
             async with asyncio.timeout(IDENTIFY_TIME):
-                stranger = await _identify(connection)
+                found = await _read_identity(connection)
         except (TimeoutError, EvseError) as error:
-            _LOGGER.debug("Somebody did not say who it is: %s", error)
+            _LOGGER.debug("A connection was not identified: %s", error)
             self.statistics.unidentified += 1
             connection.abort()
             return
         self._unidentified.pop(connection, None)
-        self._identified[connection] = stranger
-        if (bus := self._buses.get(stranger.serial)) is None:
-            self._keep_stranger(stranger, connection)
-        elif await self._may_replace(stranger, bus, connection):
-            self._bind(stranger.serial, bus, connection)
+        self._identified[connection] = found
+        if (box := self._registered.get(found.serial)) is None:
+            self._keep_unknown(found, connection)
+        elif await self._may_replace(found, box, connection):
+            self._bind(found.serial, box, connection)
 
-    def _keep_stranger(self, stranger: Stranger, connection: Connection) -> None:
-        self.statistics.strangers += 1
-        serial = stranger.serial
-        if (before := self._strangers.get(serial)) is not None:
+    def _keep_unknown(self, found: UnknownBox, connection: Connection) -> None:
+        self.statistics.unknown += 1
+        serial = found.serial
+        if (before := self._unknown.get(serial)) is not None:
             before.abort()
-        if len(self._strangers) >= MOST_STRANGERS:
+        if len(self._unknown) >= MOST_UNKNOWN:
             connection.abort()
         else:
-            self._strangers[serial] = connection
+            self._unknown[serial] = connection
             self._timers[connection] = asyncio.get_running_loop().call_later(
-                STRANGER_TIME, connection.abort
+                UNKNOWN_TIME, connection.abort
             )
         try:
-            self.on_stranger(stranger)
+            self.on_unknown_box(found)
         except Exception:
             _LOGGER.exception("A listener failed")
 
+    def _bind(self, serial: str, box: _RegisteredBox, connection: Connection) -> None:
+        if self._registered.get(serial) is not box:
+            connection.abort()
+            return
+        self._warned.discard(serial)
+        self._bound[serial] = connection
+        box.line.attach(connection)
+        box.bus.reschedule()
+
+    # -- Two connections with one number -----------------------------------------------
+
     async def _may_replace(
-        self, stranger: Stranger, bus: Bus, connection: Connection
+        self, found: UnknownBox, box: _RegisteredBox, connection: Connection
     ) -> bool:
         """Return whether this connection may be the box's: the old one is asked."""
-        line, serial = bus.line, stranger.serial
-        if not isinstance(line, AcceptedLine) or not line.is_open:
+        line, serial = box.line, found.serial
+        if not line.is_open:
             return True
-        if serial in self._asking:
-            self._refuse(stranger, bus, connection)
+        if serial in self._proving:
+            self._refuse(found, box.bus, connection)
             return False
-        self._asking.add(serial)
+        self._proving.add(serial)
         try:
-            await self._pause_asking(serial)
-            _ask_now(bus)
-            alive = await line.answers(PROOF_TIME)
+            await self._wait_for_proof_pause(serial)
+            box.ports.poll_now()
+            answers = await line.answers(PROOF_TIME)
         finally:
-            self._asking.discard(serial)
-        if alive:
-            self._refuse(stranger, bus, connection)
+            self._proving.discard(serial)
+        if answers:
+            self._refuse(found, box.bus, connection)
             return False
         self.statistics.replaced += 1
         line.end("another connection has its number, and this one does not answer")
         return connection.is_open
 
-    async def _pause_asking(self, serial: str) -> None:
-        """Wait: whoever dials all the time does not keep the box busy with us."""
+    async def _wait_for_proof_pause(self, serial: str) -> None:
+        """Wait: a device that dials all the time must not keep the box busy."""
         loop = asyncio.get_running_loop()
-        before = self._asked_at.get(serial, -inf)
+        before = self._proved_at.get(serial, -inf)
         await asyncio.sleep(before + PROOF_PAUSE - loop.time())
-        self._asked_at[serial] = loop.time()
+        self._proved_at[serial] = loop.time()
 
-    def _refuse(self, stranger: Stranger, bus: Bus, connection: Connection) -> None:
-        self.statistics.seconds += 1
+    def _refuse(self, found: UnknownBox, bus: Bus, connection: Connection) -> None:
+        self.statistics.duplicates += 1
         connection.abort()
         now = asyncio.get_running_loop().time()
-        if stranger.serial in self._warned or not self._warnings.take(now):
+        if found.serial in self._warned or not self._warnings.take(now):
             return
-        self._warned.add(stranger.serial)
-        message = "%s says that it is %s, which is connected and answers"
-        _LOGGER.warning(message, stranger.peer, bus.name)
-
-    def _bind(self, serial: str, bus: Bus, connection: Connection) -> None:
-        if self._buses.get(serial) is not bus or not isinstance(bus.line, AcceptedLine):
-            connection.abort()
-            return
-        self._warned.discard(serial)
-        self._bound[serial] = connection
-        bus.line.attach(connection)
-        bus.reschedule()
+        self._warned.add(found.serial)
+        message = "%s gives the number of %s, which is connected and answers"
+        _LOGGER.warning(message, found.peer, bus.name)
 
 
-async def _identify(connection: Connection) -> Stranger:
-    """Ask ``id`` and ``rs``; raises EvseError when that comes to nothing."""
+async def _read_identity(connection: Connection) -> UnknownBox:
+    """Read ``id`` and ``rs``; raises EvseError when the connection ends meanwhile."""
     framer = EwsFramer()
-    line = AcceptedLine("somebody", lambda: framer.noise)
+    line = AcceptedLine("unidentified", lambda: framer.noise)
     wire = Wire(line, framer, TCP_TIMING)
     line.on_lost = wire.fail
-    early: list[bytes] = []
+    infos: list[bytes] = []
 
-    def unasked(frame: Frame) -> bool:
-        told = isinstance(frame, EwsFrame) and frame.message_id is MessageId.INFO
-        if told:
-            # What has happened at the box meanwhile is for its bus.
-            early.append(frame.raw)
-        return told
+    def keep_info(frame: Frame) -> bool:
+        is_info = isinstance(frame, EwsFrame) and frame.message_id is MessageId.INFO
+        if is_info:
+            # An event at the box, for its bus.
+            infos.append(frame.raw)
+        return is_info
 
-    wire.on_unsolicited = unasked
+    wire.on_unsolicited = keep_info
     line.attach(connection)
     await line.open()
-    box = EwsBox()
-    await box.identify(Turn(wire, ChargerStatistics()))
-    status = box.status
-    if status is None or not connection.is_open:
+    status = await EwsBox().wait_for_status(Turn(wire, ChargerStatistics()))
+    if not connection.is_open:
         raise LineError("the connection has ended")
     connection.line = None
     line.release()
-    connection.keep(b"".join(early))
-    return Stranger(
+    connection.keep(b"".join(infos))
+    return UnknownBox(
         serial=status.serial, firmware=status.firmware, peer=connection.peer
     )
 
 
 def _plain(network: Network) -> Network:
-    """Return a network of IPv4 as one, also if it is written in the way of IPv6."""
+    """Return an IPv4 network as such, also if given in the form of IPv6."""
     mapped = getattr(network.network_address, "ipv4_mapped", None)
     if mapped is None or network.prefixlen < _MAPPED:
         return network
     return IPv4Network((mapped, network.prefixlen - _MAPPED))
 
 
-def _ask_now(bus: Bus) -> None:
-    for charger in bus.chargers.values():
-        if isinstance(charger, EwsPort):
-            charger.ask_now()
-
-
 def _error(error: Exception) -> LineError:
     code = getattr(error, "errno", None)
     if code == errno.EADDRINUSE:
         return PortBusyError(str(error))
-    # None of a host's addresses being ours comes without a code, as does what is no
-    # host; a link-local address without its interface (fe80::1%eth0) is invalid.
+    # No errno: none of the host's addresses is ours, or it is no host. EINVAL: a
+    # link-local address without its interface (fe80::1%eth0).
     if code in (errno.EADDRNOTAVAIL, errno.EINVAL, None):
         return PortMissingError(str(error))
     return line_error(error)

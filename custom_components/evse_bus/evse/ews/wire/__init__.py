@@ -1,1 +1,1 @@
-"""Messages of the EWS-Box: frames, records, commands and answers; no conversations."""
+"""Messages of MCS binary: frames, records, commands and answers. Pure functions."""

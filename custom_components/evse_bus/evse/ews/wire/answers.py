@@ -1,8 +1,8 @@
-"""Answers to commands: which are ours, what they confirm, and why a box refuses.
+"""Answers to commands: matching, decoding, and the reasons of a refusal.
 
-Source: manual, 3.2.4. Most commands answer one byte, of which 0 is named OK where
-anything is named; only ``sl`` has codes. The other commands' reasons are what their
-descriptions say about when they work.
+Source: manual, 3.2.4. Most commands are answered by one byte: 0 is OK, as far as it is
+defined; only ``sl`` has codes for reasons. For other commands the reason is taken from
+the conditions in their descriptions.
 """
 
 from collections.abc import Callable, Mapping
@@ -60,7 +60,7 @@ START_STOP_CODES: Final[Mapping[int, Refusal]] = {
     11: Refusal.RCD,
     12: Refusal.PORT_BLOCKED,
 }
-"""Answers of ``sl``; 8 and what follows 12 are unknown to the manual."""
+"""Answers to ``sl``; 8, and those from 13, are not in the manual."""
 
 COMMAND_REFUSALS: Final[Mapping[CommandId, Refusal]] = {
     CommandId.SET_METER: Refusal.METER,
@@ -78,7 +78,7 @@ COMMAND_REFUSALS: Final[Mapping[CommandId, Refusal]] = {
     CommandId.WRITE_USER: Refusal.USER_PARAMETERS,
     CommandId.WRITE_EXTRA: Refusal.EXTRA_PARAMETERS,
 }
-"""Commands that answer with one byte of which only 0 is known."""
+"""Commands answered by one byte of which only 0 is defined."""
 
 MESSAGES: Final[Mapping[Refusal, str]] = {
     Refusal.INVALID_PARAMETER: "the box does not know this port or this order",
@@ -91,7 +91,7 @@ MESSAGES: Final[Mapping[Refusal, str]] = {
     Refusal.CARD_READER: "the card reader is missing",
     Refusal.RCD: "the residual current device has tripped",
     Refusal.PORT_BLOCKED: "the other port is in use and blocks this one",
-    Refusal.UNKNOWN: "the box gives a reason that the manual does not know",
+    Refusal.UNKNOWN: "the box gives a reason that is not in the manual",
     Refusal.METER: "the meter total was not set",
     Refusal.FIRMWARE: "the firmware was not activated",
     Refusal.CARD: "the card was not accepted",
@@ -113,10 +113,10 @@ MESSAGES: Final[Mapping[Refusal, str]] = {
 
 
 class EwsRefusedError(ExchangeRefusedError):
-    """A box that says no, with its reason."""
+    """A command that the box refused, with the reason."""
 
     def __init__(self, command: CommandId, code: int) -> None:
-        """Find the reason for the code that this command was answered with."""
+        """Look up the reason for ``code``, the answer to ``command``."""
         reason = refusal(command, code)
         super().__init__(f"{MESSAGES[reason]} ({command}: {code})", code)
         self.command = command
@@ -125,7 +125,7 @@ class EwsRefusedError(ExchangeRefusedError):
 
 
 def refusal(command: CommandId, code: int) -> Refusal:
-    """Return why a command was refused, by the code of its answer (not 0)."""
+    """Return the reason for a refusal by the code of the answer (not 0)."""
     if command is CommandId.START_STOP:
         return START_STOP_CODES.get(code, Refusal.UNKNOWN)
     return COMMAND_REFUSALS.get(command, Refusal.UNKNOWN)
@@ -134,10 +134,10 @@ def refusal(command: CommandId, code: int) -> Refusal:
 def answer[T](
     command: CommandId, decode: Callable[[bytes], T], bcc: Bcc | None = None
 ) -> Callable[[EwsFrame], T | None]:
-    """Return what knows the answer to a command, and makes of its bytes what it says.
+    """Return a matcher for the answer to a command, which decodes its data.
 
-    ``bcc``: the one reading that this box answers by, once it is known; an answer by
-    the other is nobody's. What it returns raises what ``decode`` raises.
+    ``bcc``: the checksum that the box uses, once it is known; answers with the other
+    one do not match. The matcher raises what ``decode`` raises.
     """
 
     def accept(frame: EwsFrame) -> T | None:
@@ -149,10 +149,10 @@ def answer[T](
 
 
 def confirmed(command: CommandId) -> Callable[[bytes], bool]:
-    """Return what makes ``True`` of the answer that says OK.
+    """Return a decoder for an answer of one byte; it returns ``True`` for OK.
 
-    It raises EwsRefusedError for one that says no, ImplausibleReplyError for one that
-    is not one byte.
+    The decoder raises EwsRefusedError for a refusal, ImplausibleReplyError for an
+    answer that is not one byte.
     """
 
     def decode(data: bytes) -> bool:
@@ -166,9 +166,9 @@ def confirmed(command: CommandId) -> Callable[[bytes], bool]:
 
 
 def decode_reset(data: bytes) -> bool:
-    """Return ``True`` for the answer to ``zz``, which has nothing in it.
+    """Return ``True`` for the answer to ``zz``, which has no data.
 
-    Raises ImplausibleReplyError for one that has: it confirms nothing that is known.
+    Raises ImplausibleReplyError for one with data.
     """
     if data:
         message = f"zz: an answer of {len(data)} bytes, not 0"
@@ -177,9 +177,9 @@ def decode_reset(data: bytes) -> bool:
 
 
 def decode_firmware_id(data: bytes) -> str:
-    """Return what the answer to ``id`` says: 11 bytes, in an example 3.
+    """Return the firmware id of an answer to ``id``: 11 bytes, in one example 3.
 
-    Raises ImplausibleReplyError for nothing, for more, and for what is no text.
+    Raises ImplausibleReplyError for an empty, longer or unreadable one.
     """
     text = data.rstrip(b"\0 ").decode("latin-1")
     if not text or len(data) > FIRMWARE_LENGTH or not text.isprintable():
@@ -192,7 +192,7 @@ FIRMWARE_LENGTH: Final = 11
 
 
 def decode_card_reader(data: bytes) -> bytes:
-    """Return what the card reader answered to ``mc``.
+    """Return the reply of the card reader in an answer to ``mc``.
 
     Raises EwsRefusedError, and ImplausibleReplyError for an empty answer.
     """

@@ -1,4 +1,4 @@
-"""What an EWS-Box tells of itself as a whole: ``rs``, ``rg``.
+"""Records of an EWS-Box about itself as a whole: ``rs``, ``rg``.
 
 Source of the tables: manual, 3.2.4. Cards and the box's network are private: no repr
 shows them.
@@ -14,14 +14,14 @@ from ...structs import Struct, coded, optional, record
 from .fields import Address, Identity, Moment
 
 _SUPPLY: Final = (0, *range(6, 81))
-"""A: not told, or from the lowest limit (3.1.8) to what a control pilot can offer."""
+"""A: not known, or from the lowest limit (3.1.8) to the most a control pilot offers."""
 
 
 # -- rs: the box -------------------------------------------------------------------
 
 
 class BoxFlags(IntFlag, boundary=KEEP):
-    """State of the box as a whole."""
+    """Flags of the box as a whole."""
 
     RESTARTED = 1 << 0
     LOCK_CONFIGURED = 1 << 1
@@ -37,9 +37,9 @@ class PresentedCard:
     tag: bytes = coded(Raw(width=7), secret=True)
     """Number of the tag, 7 bytes."""
     valid: bool = coded(Flag())
-    """The box's own list knows it. Means nothing over Ethernet: always yes there."""
+    """It is in the box's own list. Without meaning over Ethernet: always set there."""
     decode_error: int = coded(Number(width=1))
-    """0: it could be read."""
+    """0: the card could be read."""
     group: int = coded(Number(width=2), secret=True)
     number: int = coded(Number(width=2), secret=True)
     """Within its group."""
@@ -51,7 +51,7 @@ PRESENTED_CARD: Final = Struct(PresentedCard, "3.2.4 rs: card")
 
 @record
 class BoxStatus:
-    """What ``rs`` tells of the box."""
+    """Status of the box (``rs``)."""
 
     firmware: str = coded(Text(width=11))
     flags: BoxFlags = coded(Flags(kind=BoxFlags))
@@ -61,18 +61,18 @@ class BoxStatus:
     website_crc: int = coded(Number(width=2))
     website_version: str = coded(Text(width=20))
     lan_error: int = coded(Number(width=1))
-    """Of the LAN chip when it was started; 0: none."""
+    """Of the LAN chip at start-up; 0: none."""
     mac: bytes = coded(Raw(width=6), secret=True)
     server_connected: bool = coded(Flag())
     web_client: IPv4Address = coded(Address(), secret=True)
-    """Who looks at the box's web page."""
+    """Client of the box's web page."""
     maximum_current: int = coded(Number(width=1, unit="A", possible=_SUPPLY))
-    """Highest charging current or fuse of the box, A; 0: not told (yet)."""
+    """Highest charging current or fuse of the box, A; 0: not known (yet)."""
     ventilating: bool = coded(Flag())
     clock: datetime | None = coded(Moment())
     """In the box's time zone; ``None``: not set."""
     reader_error: int = coded(Number(width=1))
-    """Of the card reader when it was started; 0: found and right."""
+    """Of the card reader at start-up; 0: found, and correct."""
     reader_firmware: str = coded(Text(width=11))
     card: PresentedCard | None = coded(optional(PRESENTED_CARD), secret=True)
     """At the reader now."""
@@ -82,16 +82,16 @@ BOX: Final = Struct(BoxStatus, "3.2.4 rs")
 
 
 def decode_box(data: bytes) -> BoxStatus:
-    """Return what the answer to ``rs`` says; raises ImplausibleReplyError."""
+    """Decode the answer to ``rs``; raises ImplausibleReplyError."""
     return BOX.decode(data)
 
 
-# -- rg: what DHCP gave ------------------------------------------------------------
+# -- rg: DHCP ----------------------------------------------------------------------
 
 
 @record
 class Dhcp:
-    """What ``rg`` tells of a box with DHCP."""
+    """Network settings that the box got by DHCP (``rg``)."""
 
     address: IPv4Address = coded(Address(), secret=True)
     gateway: IPv4Address = coded(Address(), secret=True)
@@ -100,14 +100,14 @@ class Dhcp:
     """Its "logical" address."""
     server_real: IPv4Address = coded(Address(), secret=True)
     lease: int = coded(Number(width=4, unit="s"))
-    """s; 0: for ever."""
+    """s; 0: without end."""
     lease_left: int = coded(Number(width=4, unit="s"))
-    """s; the connection is dropped at half the lease."""
+    """s; the box drops the connection at half the lease."""
 
 
 DHCP: Final = Struct(Dhcp, "3.2.4 rg")
 
 
 def decode_dhcp(data: bytes) -> Dhcp:
-    """Return what the answer to ``rg`` says; raises ImplausibleReplyError."""
+    """Decode the answer to ``rg``; raises ImplausibleReplyError."""
     return DHCP.decode(data)

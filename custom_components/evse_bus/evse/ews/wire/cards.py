@@ -1,8 +1,8 @@
 """RFID cards: the box's own list (``rf``, ``sf``) and accepting one (``ma``).
 
-Source: manual, 3.2.4 (``sf``, ``ma``) and 3.1.6. The two contradict each other: 3.1.6
-has 1 for a single card and 2 for a group, ``sf`` has them the other way round and
-leaves out 3, a blocked card. The command reference is taken, and 3 from 3.1.6.
+Source: manual, 3.2.4 (``sf``, ``ma``) and 3.1.6, which contradict each other: in 3.1.6
+1 is a single card and 2 a group, in ``sf`` the other way round, and ``sf`` has no 3, a
+blocked card. Used here are 1 and 2 of ``sf``, and 3 of 3.1.6.
 """
 
 from collections.abc import Mapping
@@ -24,7 +24,7 @@ TAG_LENGTH: Final = 7
 
 
 class EntryKind(IntEnum):
-    """What an entry of the list says, by ``sf``."""
+    """Kinds of entries, by ``sf``."""
 
     FREE = 0
     GROUP = 1
@@ -32,12 +32,12 @@ class EntryKind(IntEnum):
     CARD = 2
     """This card may charge."""
     BLOCKED = 3
-    """This card may not, whatever its group may (3.1.6)."""
+    """This card may not charge, even if its group may (3.1.6)."""
 
 
 @record
 class CardEntry:
-    """One entry of the list, as the 32 bits that it is."""
+    """One entry of the list, 32 bits."""
 
     raw: int = coded(Number(width=4), secret=True)
 
@@ -48,7 +48,7 @@ class CardEntry:
 
     @property
     def kind(self) -> EntryKind | None:
-        """Return what it says; ``None``: a kind that is not in the manual."""
+        """Return its kind; ``None``: one that is not in the manual."""
         return EntryKind(self.kind_code) if self.kind_code in EntryKind else None
 
     @property
@@ -66,9 +66,10 @@ _ENTRY: Final = Struct(CardEntry, "3.2.4 sf: entry")
 
 
 def card_entry(kind: EntryKind, group: int = 0, card: int = 0) -> CardEntry:
-    """Return an entry for the list; RefusedOrderError for what does not fit.
+    """Return an entry for the list.
 
-    0 is no number of a group or card (3.1.6); a whole group has no card.
+    0 is no number of a group or card (3.1.6); a whole group has no card. Raises
+    RefusedOrderError for numbers that do not fit.
     """
     numbered = kind is not EntryKind.FREE
     single = kind in (EntryKind.CARD, EntryKind.BLOCKED)
@@ -76,25 +77,25 @@ def card_entry(kind: EntryKind, group: int = 0, card: int = 0) -> CardEntry:
         message = f"a group is 1 to {LARGEST}, and 0 in a free entry"
         raise RefusedOrderError(message)
     if card not in (range(1, LARGEST + 1) if single else range(1)):
-        message = f"a card is 1 to {LARGEST}, and 0 where none is meant"
+        message = f"a card is 1 to {LARGEST}, and 0 in an entry without a card"
         raise RefusedOrderError(message)
     return CardEntry(raw=kind << _KIND_SHIFT | group << _GROUP_SHIFT | card)
 
 
 @record
 class CardList:
-    """The list, all of it: it is read and written at once."""
+    """The whole list: it is read and written at once."""
 
     entries: tuple[CardEntry, ...] = coded(many(part(_ENTRY), ENTRIES), secret=True)
 
     def with_entries(self, changes: Mapping[int, CardEntry]) -> CardList:
         """Return the list with some entries (0 to 63) replaced, and nothing else.
 
-        Raises RefusedOrderError for nothing to replace, for an entry that there is
-        not, and for a new one about whom another entry says something already.
+        Raises RefusedOrderError without changes, for an entry that does not exist,
+        and for a card or group that has another entry.
         """
         if not changes:
-            raise RefusedOrderError("no entry of the list is to be replaced")
+            raise RefusedOrderError("no entry of the list is replaced")
         if not changes.keys() <= set(range(len(self.entries))):
             message = f"the list has entries 0 to {len(self.entries) - 1}"
             raise RefusedOrderError(message)
@@ -105,7 +106,7 @@ class CardList:
                 continue
             key = (entry.kind is EntryKind.GROUP, entry.group, entry.card)
             other = about.setdefault(key, at)
-            # What stands there twice already is nobody's mistake of now.
+            # Duplicates that were in the list before are left alone.
             if other != at and {at, other} & changes.keys():
                 message = f"entries {other} and {at} are about the same card or group"
                 raise RefusedOrderError(message)
@@ -116,7 +117,7 @@ CARD_LIST: Final = Struct(CardList, "3.2.4 sf")
 
 
 def decode_cards(data: bytes) -> CardList:
-    """Return what the answer to ``rf`` says; raises ImplausibleReplyError."""
+    """Decode the answer to ``rf``; raises ImplausibleReplyError."""
     return CARD_LIST.decode(data)
 
 
@@ -125,12 +126,12 @@ def write_cards(cards: CardList) -> Request:
     return Request(CommandId.WRITE_CARDS, CARD_LIST.encode(cards))
 
 
-# -- ma: accepting a card that the box itself does not know ------------------------
+# -- ma: accepting a card that is not in the list ----------------------------------
 
 
 @record
 class AcceptedCard:
-    """Whom the server accepts for the next start."""
+    """A card that the server accepts for the next start."""
 
     group: int = coded(Number(width=2, valid=range(LARGEST + 1)), secret=True)
     number: int = coded(Number(width=2, valid=range(LARGEST + 1)), secret=True)

@@ -1,6 +1,6 @@
-"""What an EWS-Box is told: one function a command, each returns a `Request`.
+"""Commands to an EWS-Box: one function for each, which returns a `Request`.
 
-Source: manual, 3.2.4. Values come from people and programs: what does not fit is
+Source: manual, 3.2.4. Values come from people and programs: one that does not fit is
 refused, never cut or wrapped. Cards and parameters have modules of their own.
 """
 
@@ -37,7 +37,7 @@ CONFIRMED: Final = frozenset(
         CommandId.WRITE_EXTRA,
     }
 )
-"""Commands that are answered with one byte (`answers.confirmed`)."""
+"""Commands that are answered by one byte (`answers.confirmed`)."""
 READS: Final = frozenset(
     {
         CommandId.READ_FIRMWARE_ID,
@@ -57,7 +57,7 @@ _PORT: Final = Number(name="port", width=1, valid=PORTS)
 
 
 def read(command: CommandId) -> Request:
-    """Return a command that asks, and changes nothing; RefusedOrderError for others."""
+    """Return a command that only reads; raises RefusedOrderError for others."""
     if command not in READS:
         message = f"{command} does not only read"
         raise RefusedOrderError(message)
@@ -73,25 +73,25 @@ def reset() -> Request:
 
 
 def start_stop(
-    port: int, order: StartStop, seen: PortStatus, *, paused: bool = False
+    port: int, order: StartStop, status: PortStatus, *, paused: bool = False
 ) -> Request:
-    """Return an order to a port (``sl``), for the state it has just been seen in.
+    """Return an order to a port (``sl``) with this status.
 
-    The same order does other things in other states: ``seen`` is from an ``rc`` in
-    the same turn of the bus. ``paused``: we have paused this charge, and nobody has
-    ended it since. Raises NotAvailableError where the order may not be sent.
+    An order has other effects in other states: ``status`` is from an ``rc`` in the same
+    turn of the bus. ``paused``: the port is in a pause of ours, or may be. Raises
+    NotAvailableError where the order may not be sent.
     """
-    check_order(order, seen.status, paused=paused)
+    check_order(order, status.state, paused=paused)
     return Request(CommandId.START_STOP, _PORT.encode(port) + bytes((order,)))
 
 
-def unlock(port: int, seen: PortStatus) -> Request:
-    """Return the order that unlocks a plug where nothing charges (``sl`` 6, 3.1.8).
+def unlock(port: int, status: PortStatus) -> Request:
+    """Return the order that unlocks a plug without a charge (``sl`` 6, 3.1.8).
 
-    The same order pauses where something does: ``seen`` is from an ``rc`` in the same
-    turn of the bus. Raises NotAvailableError where it would not unlock.
+    The same order pauses a charge: ``status`` is from an ``rc`` in the same turn of the
+    bus. Raises NotAvailableError where it would not unlock.
     """
-    check_unlock(seen)
+    check_unlock(status)
     return Request(CommandId.START_STOP, _PORT.encode(port) + bytes((StartStop.PAUSE,)))
 
 
@@ -103,9 +103,9 @@ _LIMIT: Final = Number(name="limit", width=1, unit="A", valid=range(MINIMUM_LIMI
 def set_limit(port: int, setpoint: Setpoint) -> Request:
     """Return the limit of a port in whole amperes (``st``).
 
-    0 switches the limit off here, which gives the car all there is: a pause is
-    `StartStop.PAUSE`, and a set-point that is one raises RefusedOrderError, as does
-    one that is not a whole number from 6 A.
+    0 would switch the limit off, so that the car gets all there is: a pause is
+    `StartStop.PAUSE`. Raises RefusedOrderError for a set-point that is a pause, or no
+    whole number from 6 A.
     """
     current = setpoint.current
     if not current.is_integer():
@@ -133,11 +133,11 @@ def set_meter(port: int, total: int) -> Request:
 def set_clock(clock: datetime) -> Request:
     """Return the command that sets the clock (``sc``).
 
-    ``clock`` has no zone: it is the time in the zone of the box, as ``rs`` tells it
-    (the manual says so of ``rs`` only). Raises RefusedOrderError otherwise.
+    ``clock``: without a zone, it is the time in the zone of the box, as in ``rs`` (in
+    the manual for ``rs`` only). Raises RefusedOrderError otherwise.
     """
     if clock.year not in _YEARS:
-        message = f"no clock shows the year {clock.year} today"
+        message = f"{clock.year} is no year from 2000 to 2099"
         raise RefusedOrderError(message)
     return Request(CommandId.SET_CLOCK, _CLOCK.encode(clock))
 
@@ -149,14 +149,14 @@ _FOREVER: Final = 0xFFFF
 
 @record
 class Led:
-    """What one LED is to do."""
+    """One LED."""
 
     on: int = coded(Number(width=2, unit="ms"))
-    """ms; 0: dark, 65535: lit, or as it was if ``off`` is 65535 too."""
+    """ms; 0: dark, 65535: lit, or unchanged if ``off`` is 65535 too."""
     off: int = coded(Number(width=2, unit="ms"))
     """ms"""
     offset: int = coded(Number(width=2, unit="ms"), default=0)
-    """Where in its rhythm it begins, ms."""
+    """Position in its rhythm to begin at, ms."""
 
 
 _LED: Final = Struct(Led, "3.2.4 se: LED")
@@ -166,9 +166,9 @@ LED_UNCHANGED: Final = Led(on=_FOREVER, off=_FOREVER)
 
 
 def blinking(on: int, off: int, offset: int = 0) -> Led:
-    """Return an LED that is lit and dark for so many ms, again and again.
+    """Return an LED that is lit and dark for so many ms in turn.
 
-    Raises RefusedOrderError where it would be always lit, always dark or unchanged.
+    Raises RefusedOrderError if it would be always lit, always dark or unchanged.
     """
     if on not in range(1, _FOREVER) or off not in range(1, _FOREVER + 1):
         message = f"{on} ms on and {off} ms off is no blinking"
@@ -202,7 +202,7 @@ LEDS: Final = Struct(Leds, "3.2.4 se")
 def set_leds(first: PortLeds, second: PortLeds) -> Request:
     """Return the command that sets LEDs by hand (``se``); times in ms.
 
-    Only a box whose keys and LEDs are set to manual takes it. Raises
+    Only a box whose keys and LEDs are set to manual accepts it. Raises
     RefusedOrderError for times that do not fit.
     """
     return Request(CommandId.SET_LEDS, LEDS.encode(Leds(ports=(first, second))))
@@ -212,7 +212,7 @@ def set_leds(first: PortLeds, second: PortLeds) -> Request:
 
 
 class ReaderTarget(IntEnum):
-    """Who is spoken to behind the box."""
+    """Recipient of a command behind the box."""
 
     READER = 1
     CARD = 2
@@ -224,9 +224,9 @@ _TIMEOUT: Final = Number(name="time-out", width=1, unit="s")
 
 
 def card_reader(target: ReaderTarget, timeout: int, data: bytes) -> Request:
-    """Return a command for the card reader, handed on as it is (``mc``).
+    """Return a command for the card reader, which is passed on unchanged (``mc``).
 
-    ``timeout``: of the reader, s. Raises RefusedOrderError for what does not fit.
+    ``timeout``: of the reader, s. Raises RefusedOrderError for values that do not fit.
     """
     if target not in ReaderTarget:
         message = f"{target} is neither the reader nor the card"
@@ -241,11 +241,11 @@ def card_reader(target: ReaderTarget, timeout: int, data: bytes) -> Request:
 
 # -- oe, ow, fw: firmware ----------------------------------------------------------
 #
-# How these make an update is not in the manual (3.2.4.1 is empty): a box can be
-# bricked with them.
+# The procedure of an update is not in the manual (3.2.4.1 is empty): wrong use may
+# make a box unusable.
 
 MAXIMUM_ROM_BYTES: Final = 1024
-"""Bytes that one ``ow`` writes at most."""
+"""Most bytes of one ``ow``."""
 _ROM_ADDRESS: Final = Number(name="address", width=4)
 _ROM_COUNT: Final = Number(name="count", width=4, unit="bytes")
 
@@ -260,7 +260,7 @@ def erase_rom(start: int, count: int) -> Request:
 def write_rom(start: int, data: bytes) -> Request:
     """Return the command that writes to the temporary memory (``ow``).
 
-    Raises RefusedOrderError for nothing and for more than 1024 bytes.
+    Raises RefusedOrderError for no bytes, and for more than 1024.
     """
     if not 0 < len(data) <= MAXIMUM_ROM_BYTES:
         message = f"{len(data)} bytes, not 1 to {MAXIMUM_ROM_BYTES}"
@@ -272,5 +272,5 @@ def write_rom(start: int, data: bytes) -> Request:
 
 
 def activate_firmware() -> Request:
-    """Return the command that installs what stands in the memory (``fw``)."""
+    """Return the command that installs the firmware in the memory (``fw``)."""
     return Request(CommandId.ACTIVATE_FIRMWARE)

@@ -1,8 +1,8 @@
 """Messages of MCS binary, the protocol of the EWS-Box. Pure functions.
 
 A message is ``STX length message-id parameters BCC``; the length, 16 bits big-endian,
-counts the parameters alone. The parameters of a command, of its answer and of an info
-record begin with two letters that name it (manual, 3.2.2, 3.2.3).
+is that of the parameters alone. The parameters of a command, of its answer and of an
+info record begin with its name, two letters (manual, 3.2.2, 3.2.3).
 """
 
 from dataclasses import dataclass, field
@@ -15,20 +15,20 @@ from ...framing import Frame, Framer
 STX: Final = 0x02
 STX_BYTE: Final = b"\x02"
 MAXIMUM_PARAMETERS: Final = 1040
-"""Bytes of parameters that a message has at most (3.2.2)."""
+"""Most bytes of parameters in a message (3.2.2)."""
 _EXTRA: Final = 5
 """Bytes of a message beside its parameters: STX, length, message-id, BCC."""
 LONGEST_FRAME: Final = MAXIMUM_PARAMETERS + _EXTRA
 _HEAD: Final = 6
-"""Bytes up to the end of the two letters."""
+"""Bytes up to the end of the name."""
 _LETTERS: Final = frozenset(b"abcdefghijklmnopqrstuvwxyz")
 
 
 class Bcc(Enum):
-    """What the checksum covers; the manual can be read both ways.
+    """Bytes that the checksum covers; the manual allows two readings.
 
-    3.2.2: "length + payload", and its table calls the parameters payload; 3.2.3
-    counts the message-id as payload too. A message cannot check by both.
+    3.2.2: "length + payload", and its table calls the parameters payload; in 3.2.3
+    the message-id is payload too. No message is valid under both.
     """
 
     ALL = "all"
@@ -37,7 +37,7 @@ class Bcc(Enum):
 
 
 class MessageId(IntEnum):
-    """What a message is (3.2.2)."""
+    """Kinds of messages (3.2.2)."""
 
     ANSWER = ord("A")
     COMMAND = ord("C")
@@ -46,7 +46,7 @@ class MessageId(IntEnum):
 
 
 _APPLICATION: Final = 0x80
-"""Message-ids from here on are an application's own."""
+"""Message-ids from here on are free for applications."""
 _NAMED: Final = (MessageId.ANSWER, MessageId.COMMAND, MessageId.INFO)
 
 
@@ -99,16 +99,16 @@ PRIVATE: Final = frozenset(
         CommandId.WRITE_USER,
     }
 )
-"""Commands with names, cards, passwords or network settings in them or in their
-answers: those bytes belong in no log."""
+"""Commands with names, cards, passwords or network settings in their parameters or
+answers, which must not be logged."""
 _PRIVATE_NAMES: Final = frozenset(command.encode() for command in PRIVATE)
 
 
 def checksum(content: bytes, bcc: Bcc) -> int:
-    """Return the BCC over what stands between STX and BCC."""
+    """Return the BCC of the bytes between STX and BCC."""
     if bcc is Bcc.WITHOUT_MESSAGE_ID:
         content = content[:2] + content[3:]
-    # Folded in halves: garbage from a network must not keep anybody busy.
+    # Folded in halves, since garbage from a network may be long.
     folded, left = int.from_bytes(content), len(content)
     while left > 1:
         left = (left + 1) // 2
@@ -117,7 +117,7 @@ def checksum(content: bytes, bcc: Bcc) -> int:
 
 
 def encode(message_id: int, parameters: bytes, bcc: Bcc) -> bytes:
-    """Return a whole message; RefusedOrderError for too many parameters."""
+    """Return a whole message; raises RefusedOrderError for too many parameters."""
     if len(parameters) > MAXIMUM_PARAMETERS:
         message = f"{len(parameters)} bytes of parameters, not {MAXIMUM_PARAMETERS}"
         raise RefusedOrderError(message)
@@ -127,7 +127,7 @@ def encode(message_id: int, parameters: bytes, bcc: Bcc) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A command, ready to be sent under either reading of the checksum."""
+    """A command, ready to be sent with either checksum."""
 
     command: CommandId
     parameters: bytes = field(default=b"", repr=False)
@@ -146,11 +146,11 @@ class EwsFrame(Frame):
     raw: bytes = field(repr=False)
     message_id: MessageId
     name: str
-    """The two letters that its parameters begin with."""
+    """The two letters at the begin of its parameters."""
     data: bytes = field(repr=False)
-    """What follows them."""
+    """The parameters after the name."""
     bcc: Bcc
-    """The reading by which its checksum is right."""
+    """The kind of its checksum."""
 
     def answers(self, command: CommandId) -> bool:
         """Return whether this is an answer to this command."""
@@ -158,10 +158,10 @@ class EwsFrame(Frame):
 
 
 def redacted(raw: bytes) -> bytes:
-    """Return bytes as they may stand in a log: what may be private is zero.
+    """Return bytes for a log, with private ones set to zero.
 
-    Of a message that is known and not private, everything is kept; of a private one
-    the head with its name; of anything else only the number of bytes.
+    A known message that is not private is kept whole; of a private one the head with
+    its name is kept; of anything else only the length.
     """
     if _whole(raw, 0) != raw or raw[3] not in _NAMED:
         return bytes(len(raw))
@@ -173,28 +173,25 @@ def redacted(raw: bytes) -> bytes:
 
 _INFO_HEAD: Final = b"\x02\x00\x0bIif"
 _INFO_LENGTH: Final = 16
-"""Bytes of the one info record there is (3.2.3), which may come at any moment."""
+"""Bytes of an info record (3.2.3), which may come at any moment."""
 _SURE: Final = 4
-"""So many bytes of its head do not stand in another message by chance."""
+"""So many bytes of its head do not occur in another message by chance."""
 
 
 class EwsFramer(Framer[EwsFrame]):
     """Finds messages by their head, length and checksum.
 
-    A message begun is waited for, but not at the cost of others: an info record that
-    is found inside is taken out of it, and an answer or a command that is found
-    inside shows that the one begun will never end. Debug messages and those of other
-    applications are skipped whole.
+    An incomplete message is kept, but not at the cost of others: an info record inside
+    it is taken out, and an answer or a command inside it shows that it will never be
+    completed. Debug messages and those of applications are skipped whole.
     """
 
     unsolicited: ClassVar = True
 
     def __init__(self) -> None:
-        """Start with nothing heard."""
+        """Start empty."""
         super().__init__()
         self._buffer = b""
-        self.skipped = 0
-        """Good messages that concern nobody here: debug, other applications."""
 
     @property
     @override
@@ -238,9 +235,7 @@ class EwsFramer(Framer[EwsFrame]):
                     continue
                 self.bad += 1
                 begun = None
-            if frame is None:
-                self.skipped += 1
-            else:
+            if frame is not None:
                 found.append(frame)
             self.noise += at - taken
             taken = at = at + len(whole)
@@ -251,13 +246,13 @@ class EwsFramer(Framer[EwsFrame]):
 
 
 _TRUSTED_INSIDE: Final = frozenset({"if", *CommandId})
-"""Names that are believed where they might be the contents of another message."""
+"""Names that are accepted inside what may be another message."""
 
 
 def _length(head: bytes) -> int | None:
-    """Return how long a message is that begins so; ``None``: none does.
+    """Return the length of a message with this head; ``None``: no message has it.
 
-    While its head has not come whole, a length that its bytes do not reach either.
+    For an incomplete head, the length of the head.
     """
     if len(head) < 4:
         return _HEAD
@@ -273,19 +268,19 @@ def _length(head: bytes) -> int | None:
 
 
 def _whole(buffer: bytes, at: int) -> bytes | None:
-    """Return the good message that begins here, if it has come to its end."""
+    """Return the good message that begins here, if it is complete."""
     length = _length(buffer[at : at + _HEAD])
     if length is None or length > min(LONGEST_FRAME, len(buffer) - at):
         return None
     raw = buffer[at : at + length]
-    # With a record in its middle, its checksum is right by chance only.
-    if _reading(raw) is None or _record_inside(buffer, at, at + length, _SURE):
+    # With an info record inside, its checksum is right by chance only.
+    if _bcc(raw) is None or _record_inside(buffer, at, at + length, _SURE):
         return None
     return raw
 
 
-def _reading(raw: bytes) -> Bcc | None:
-    """Return the reading by which the checksum of a message is right."""
+def _bcc(raw: bytes) -> Bcc | None:
+    """Return the kind of checksum that is right for a message; ``None``: neither."""
     content = raw[1:-1]
     for bcc in Bcc:
         if checksum(content, bcc) == raw[-1]:
@@ -294,8 +289,8 @@ def _reading(raw: bytes) -> Bcc | None:
 
 
 def _frame(raw: bytes) -> EwsFrame | None:
-    """Return a good message as a frame; ``None``: one to skip."""
-    bcc = _reading(raw)
+    """Return the frame of a good message; ``None``: one to skip."""
+    bcc = _bcc(raw)
     if raw[3] not in _NAMED or bcc is None:
         return None
     return EwsFrame(
@@ -308,24 +303,24 @@ def _frame(raw: bytes) -> EwsFrame | None:
 
 
 def _may_end(buffer: bytes, at: int) -> bool:
-    """Return whether what begins here may become a good message."""
+    """Return whether a good message may begin here."""
     length = _length(buffer[at : at + _HEAD])
     if length is not None and len(buffer) - at < length <= LONGEST_FRAME:
         return True
-    # It looks broken: it may be whole but for an info record in its middle.
+    # It seems broken, but may be good except for an info record inside it.
     end = at + (_HEAD if length is None else min(length, LONGEST_FRAME))
     return _record_inside(buffer, at, end, 1)
 
 
 def _record_inside(buffer: bytes, at: int, end: int, least: int) -> bool:
-    """Return whether an info record begins inside a message, and is not broken.
+    """Return whether a good info record begins inside a message.
 
-    ``least``: so many of its bytes must have come.
+    ``least``: the bytes of it that must have been received.
     """
     inside = at
     while (inside := buffer.find(_INFO_HEAD, inside + 1, end + _HEAD - 1)) >= 0:
         record = buffer[inside : inside + _INFO_LENGTH]
-        if len(record) < _INFO_LENGTH or _reading(record) is not None:
+        if len(record) < _INFO_LENGTH or _bcc(record) is not None:
             return True
     return any(
         at < len(buffer) - come < end and buffer.endswith(_INFO_HEAD[:come])

@@ -1,4 +1,4 @@
-"""The record that an EWS-Box sends unasked: ``I`` with ``if``.
+"""The record that an EWS-Box sends on its own: ``I`` with ``if``.
 
 Source: manual, 3.2.3. It may come at any moment, also between a command and its
 answer, and is a reason to poll at once.
@@ -21,7 +21,7 @@ _STEP: Final = 0.1
 
 
 class Change(IntFlag, boundary=KEEP):
-    """What has changed."""
+    """Kinds of changes."""
 
     CARD = 1 << 0
     """Another card is at the reader."""
@@ -39,12 +39,12 @@ class KeyEvent:
     key: int
     """1 to 4."""
     held: float | None
-    """How long it was pressed, s; ``None``: it is pressed now."""
+    """Time for which it was pressed, s; ``None``: it is pressed now."""
 
 
 @record
 class Info:
-    """What the record tells."""
+    """One info record."""
 
     changes: Change = coded(Flags(kind=Change))
     keys: tuple[int, ...] = coded(many(Number(width=1, unit="0.1 s"), 2 * KEYS))
@@ -52,7 +52,7 @@ class Info:
 
     @property
     def key_events(self) -> tuple[KeyEvent, ...]:
-        """Return what happened to keys; only a box with manual keys tells it."""
+        """Return the events of keys; only a box with manual keys reports them."""
         return tuple(
             KeyEvent(
                 port=1 + at // KEYS,
@@ -68,7 +68,7 @@ INFO: Final = Struct(Info, "3.2.3 if")
 
 
 def decode_info(frame: EwsFrame) -> Info | None:
-    """Return what an info record tells; ``None``: it is none, or one of another name.
+    """Decode an info record; ``None``: the frame is none, or has another name.
 
     Raises ImplausibleReplyError for one of another length.
     """

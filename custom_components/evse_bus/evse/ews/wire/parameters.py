@@ -1,12 +1,12 @@
-"""What is set in an EWS-Box: ``rp ru ri rz`` read it, ``sp su si sz`` write it.
+"""Parameters of an EWS-Box: ``rp ru ri rz`` read them, ``sp su si sz`` write them.
 
-A block is changed as it was read: its bytes stay what they are but for the fields
-that are named, whatever the others mean. Source: manual, 3.2.4 (``sp``, ``su``,
-``si``, ``sz``) and the table of 3.1.1.
+A block is changed in the bytes that were read: only the named fields change, so that
+unknown ones are kept. Source: manual, 3.2.4 (``sp``, ``su``, ``si``, ``sz``) and the
+table of 3.1.1.
 
-Two of the blocks have secrets in them (passwords, the PIN of the cards), which the box
-may hide when they are read; the manual does not say. A block whose secret does not
-stand in it is not written, unless the secret is named too: it would be erased.
+Two of the blocks contain secrets (passwords, the PIN of the cards). The manual does not
+state whether they can be read. A block that was read without its secret is not written
+unless the secret is given as well: it would be erased.
 """
 
 from collections.abc import Mapping
@@ -23,19 +23,19 @@ from .frames import CommandId, Request
 
 _ANY_BYTE: Final = range(256)
 _LIMIT: Final = (0, *range(6, 81))
-"""A: none, or from the lowest limit (3.1.8) to what a control pilot can offer."""
+"""A: none, or from the lowest limit (3.1.8) to the most a control pilot offers."""
 
 
 # -- rp, sp: the installation ------------------------------------------------------
 
 
 class SystemMode(IntFlag, boundary=KEEP):
-    """How the box works."""
+    """Operating mode of the box."""
 
     SERVER = 1 << 0
-    """A server is asked for each start; else standalone."""
+    """A server allows each start; else standalone."""
     CARDS = 1 << 1
-    """Cards are asked for."""
+    """A start needs a card."""
     RS232 = 1 << 2
     """The server is on RS-232; else on Ethernet. Not to be changed over Ethernet."""
     MANUAL_IO = 1 << 3
@@ -45,7 +45,7 @@ class SystemMode(IntFlag, boundary=KEEP):
 
 
 class CableMode(IntFlag, boundary=KEEP):
-    """What hangs on the ports."""
+    """Cables of the ports."""
 
     FIXED_CABLE = 1 << 0
     """The mode 3 cable is a fixed one."""
@@ -54,7 +54,7 @@ class CableMode(IntFlag, boundary=KEEP):
 
 
 class LockType(IntEnum):
-    """How the plug is locked (3.1.1), with the makers the manual names."""
+    """How the plug is locked (3.1.1), by manufacturer."""
 
     BALS_MENNEKES = 0
     WALTHER = 1
@@ -66,7 +66,7 @@ class LockType(IntEnum):
 
 @record
 class SystemParameters:
-    """What ``rp`` tells."""
+    """System parameters (``rp``)."""
 
     admin_password: str = coded(Text(width=12), secret=True)
     ports: int = coded(Number(width=1, possible=range(1, 3)))
@@ -80,7 +80,7 @@ class SystemParameters:
     ventilation: bool = coded(Flag())
     """The installation can ventilate."""
     maximum_current: int = coded(Number(width=1, unit="A", valid=_LIMIT))
-    """A; 0: what the jumper says. With a fixed cable, the cable's too."""
+    """A; 0: set by the jumper. With a fixed cable, also the maximum of the cable."""
     restart_after_power_failure: bool = coded(Flag())
     cable_mode: CableMode = coded(Flags(kind=CableMode))
 
@@ -109,18 +109,18 @@ class TimeZone(IntEnum):
 
     GMT = 0
     CET = 1
-    """"MEZ (Deutschland)"; nothing is said of summer time."""
+    """"MEZ (Deutschland)"; the manual does not mention summer time."""
 
 
 GERMAN: Final = 0
-"""The one language the manual gives a number for."""
+"""The only language with a number in the manual."""
 SOURCE_PORTS: Final = 10
-"""The box dials from so many ports, one after the other."""
+"""The box dials from so many TCP ports, one after the other."""
 
 
 @record
 class UserParameters:
-    """What ``ru`` tells. Wrong ones cut the box off the network."""
+    """Network parameters (``ru``). Wrong ones cut the box off the network."""
 
     user_password: str = coded(Text(width=12), secret=True)
     address: IPv4Address = coded(Address(), secret=True)
@@ -139,12 +139,12 @@ class UserParameters:
 USER: Final = Struct(UserParameters, "3.2.4 su")
 
 
-# -- ri, si: whose it is -----------------------------------------------------------
+# -- ri, si: the owner -------------------------------------------------------------
 
 
 @record
 class InstallationInfo:
-    """What ``ri`` tells: texts about the owner."""
+    """Texts about the owner (``ri``)."""
 
     name: str = coded(Text(width=30), secret=True)
     street: str = coded(Text(width=30), secret=True)
@@ -161,7 +161,7 @@ INSTALLATION: Final = Struct(InstallationInfo, "3.2.4 si")
 
 @record
 class ExtraParameters:
-    """What ``rz`` tells."""
+    """Additional parameters (``rz``)."""
 
     pulses_per_kwh_2: int = coded(Number(width=4, unit="1/kWh"))
     """Of port 2's meter; 0: as port 1."""
@@ -171,10 +171,10 @@ class ExtraParameters:
     """V. The manual names no unit."""
     voltage_2: int = coded(Number(width=2, unit="V"))
     compatible_1: bool = coded(Flag())
-    """Cars that have fallen asleep are woken (3.1.1)."""
+    """The port wakes cars that are asleep (3.1.1)."""
     compatible_2: bool = coded(Flag())
     reserved: bytes = coded(Raw(width=53), secret=True)
-    """All 0 in the manual; kept as they are."""
+    """All 0 in the manual; kept as read."""
 
 
 EXTRA: Final = Struct(ExtraParameters, "3.2.4 sz")
@@ -184,15 +184,15 @@ EXTRA: Final = Struct(ExtraParameters, "3.2.4 sz")
 
 
 class HiddenSecretError(RefusedOrderError):
-    """A block that was not written, since that would erase what the box hides."""
+    """A block that was not written: that would erase a secret that the box hides."""
 
     text_key: str | None = "ews_secret_hidden"
 
     def __init__(self, source: str, names: tuple[str, ...]) -> None:
         """Keep the names of the secrets."""
         super().__init__(
-            f"{source}: the box does not tell {', '.join(names)}; writing would erase "
-            "what is not named as well"
+            f"{source}: the box hides {', '.join(names)}; writing would erase any that "
+            "is not given as well"
         )
         self.names = names
 
@@ -203,22 +203,22 @@ class HiddenSecretError(RefusedOrderError):
 
 
 class Shown(Enum):
-    """What stands where a block has a secret."""
+    """How a secret was read."""
 
     SHOWN = "shown"
     EMPTY = "empty"
-    """None is set, or the box hides it: nobody can tell."""
+    """None is set, or the box hides it."""
     MASKED = "masked"
-    """One sign over and over, or no readable text."""
+    """The same character throughout, or no readable text."""
 
 
 def shown(secret: bytes) -> Shown:
-    """Return whether a password or PIN was read as it is set."""
+    """Return whether a password or PIN could be read."""
     text = secret.split(b"\0", 1)[0].rstrip(b" ")
     if not text:
         return Shown.EMPTY
     readable = text.isascii() and text.decode("latin-1").isprintable()
-    # 0000 is a PIN that people have; stars and the like are a mask.
+    # 0000 is a possible PIN; stars and the like are a mask.
     mask = len(set(text)) == 1 and not text.isdigit()
     return Shown.MASKED if mask or not readable else Shown.SHOWN
 
@@ -231,28 +231,28 @@ class Block[T]:
     write: CommandId
     struct: Struct[T]
     secrets: frozenset[str] = frozenset()
-    """Names of the fields that a box may hide."""
+    """Names of the fields that the box may hide."""
 
     def decode(self, data: bytes) -> T:
-        """Return what the answer to the read says; raises ImplausibleReplyError."""
+        """Decode the answer to the reading command; raises ImplausibleReplyError."""
         return self.struct.decode(data)
 
-    def secrets_told(self, told: T) -> dict[str, Shown]:
-        """Return what was read in the place of each secret."""
-        # No sign that could not be read is one byte of UTF-8, so it stays unreadable.
+    def shown_secrets(self, block: T) -> dict[str, Shown]:
+        """Return for each secret of a block how it was read."""
+        # UTF-8 leaves unreadable characters unreadable: none becomes ASCII.
         return {
-            name: shown(getattr(told, name).encode()) for name in sorted(self.secrets)
+            name: shown(getattr(block, name).encode()) for name in sorted(self.secrets)
         }
 
     def change(self, data: bytes, changes: Mapping[str, object]) -> Request:
         """Return the command that writes a block just read, with these changes.
 
-        Raises RefusedOrderError for a field or value that cannot be and for nothing
-        to change, HiddenSecretError where a secret would be erased,
-        ImplausibleReplyError for bytes that are no such block.
+        Raises RefusedOrderError without changes and for an impossible field or value,
+        HiddenSecretError where a secret would be erased, ImplausibleReplyError for
+        data that are no such block.
         """
         if not changes:
-            message = f"{self.struct.source}: nothing to change"
+            message = f"{self.struct.source}: no changes"
             raise RefusedOrderError(message)
         changed = self.struct.changed(data, changes)
         hidden = []
@@ -276,7 +276,7 @@ SYSTEM_BLOCK: Final = Block(
     struct=SYSTEM,
     secrets=frozenset({"admin_password", "card_pin"}),
 )
-"""Not written while the box starts or a car charges; it starts anew afterwards."""
+"""Not written while the box starts or a car charges; the box restarts afterwards."""
 USER_BLOCK: Final = Block(
     read=CommandId.READ_USER,
     write=CommandId.WRITE_USER,

@@ -1,4 +1,4 @@
-"""The status byte of an EWS-Box's port, what it says, and what may be ordered in it.
+"""The status byte of a port of an EWS-Box: its meaning, and the orders for it.
 
 Source: manual, 3.2.4 (``rc``, ``sl``), 3.1.2 (0xAx, 0xFF), 3.1.5, 3.1.8; PROTOCOLS.md,
 section 4.
@@ -33,7 +33,7 @@ _GROUP: Final = 0xF0
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """What a status byte says by itself; ``None``: not told."""
+    """The meaning of a status byte by itself; ``None``: it has none."""
 
     name: str
     """The byte in hex, as the manual writes it."""
@@ -51,13 +51,13 @@ def _state(
 
 
 def _error(code: int, fault: Fault) -> State:
-    # Whether current still flows is for the contactor to say.
+    # The contactor shows whether current still flows.
     return State(f"0x{code:02X}", Status.FAULTED, fault=fault)
 
 
 STATES: Final[Mapping[int, State]] = {
     FREE: _state(FREE, Status.AVAILABLE, plugged=False),
-    # A cable that can be pulled is in the socket; a fixed one always is.
+    # A plug is in the socket; but with a fixed cable there may be no car (`state_of`).
     SEARCHING: _state(SEARCHING, Status.PREPARING, plugged=None),
     WAITING: _state(WAITING, Status.PREPARING, plugged=True),
     CHARGING: _state(CHARGING, Status.CHARGING, plugged=True, charging=True),
@@ -68,7 +68,7 @@ STATES: Final[Mapping[int, State]] = {
     PAUSED: _state(PAUSED, Status.SUSPENDED_EV, plugged=True),
     PAUSED_OPTIMISED: _state(PAUSED_OPTIMISED, Status.SUSPENDED_EV, plugged=True),
     ENDED: _state(ENDED, Status.FINISHING, plugged=True),
-    # Why, the result of the charge says.
+    # The result of the charge has the reason.
     ABORTED: _state(ABORTED, Status.FINISHING, plugged=True),
     0xA0: _error(0xA0, Fault.CABLE_CODE),
     0xA1: _error(0xA1, Fault.SOCKET_LOCK),
@@ -91,16 +91,18 @@ RESULT_FAULTS: Final[Mapping[ChargeResult, Fault]] = {
     ChargeResult.VENTILATION: Fault.VENTILATION_REQUESTED,
     ChargeResult.PILOT_UNSTABLE: Fault.PILOT,
 }
-"""Ends of a charge that the manual calls an error."""
+"""Results of a charge that are errors by the manual."""
 
+RUNNING: Final = frozenset({CHARGING, CHARGING_OPTIMISED, PAUSED, PAUSED_OPTIMISED})
+"""A charge is under way, pauses included."""
 AFTER_OUR_PAUSE: Final = frozenset({PAUSED, PAUSED_OPTIMISED, ENDED})
-"""Where a port may be found after `StartStop.PAUSE`."""
+"""A pause of ours may be the reason for these (`StartStop.PAUSE`)."""
 
 
 def state_of(code: int, *, fixed_cable: bool | None = None) -> State:
-    """Return what a status byte says; an unknown one keeps its raw value.
+    """Return the meaning of a status byte; an unknown one has its raw value only.
 
-    ``fixed_cable``: how the port is configured; ``None``: not known.
+    ``fixed_cable``: whether the port has one; ``None``: not known.
     """
     known = STATES.get(code)
     if known is None:
@@ -117,7 +119,7 @@ def state_of(code: int, *, fixed_cable: bool | None = None) -> State:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PortState:
-    """What is to be shown of a port."""
+    """The state of a port in terms of the model."""
 
     status: Status | None
     raw: str
@@ -128,50 +130,49 @@ class PortState:
 
 
 def port_state(
-    port: PortStatus, *, fixed_cable: bool | None = None, paused: bool = False
+    status: PortStatus, *, fixed_cable: bool | None = None, paused: bool = False
 ) -> PortState:
-    """Return what ``rc`` says of a port, in the words of everybody.
+    """Return the state of a port from its status (``rc``).
 
-    ``paused``: we have paused this charge, and nobody has ended it since.
+    ``paused``: it is in a pause of ours.
     """
-    state = state_of(port.status, fixed_cable=fixed_cable)
-    status, charging = state.status, state.charging
-    if paused and port.status in AFTER_OUR_PAUSE:
-        status = Status.SUSPENDED_EVSE
-    if charging is None and not port.contactor:
+    state = state_of(status.state, fixed_cable=fixed_cable)
+    charging = state.charging
+    is_our_pause = paused and status.state in AFTER_OUR_PAUSE
+    if charging is None and not status.contactor:
         charging = False
     faults = set() if state.fault is None else {state.fault}
-    if port.rcd_tripped:
+    if status.rcd_tripped:
         faults.add(Fault.RCD)
-    if port.status == ABORTED:
-        faults.add(_reason(port.result))
+    if status.state == ABORTED:
+        faults.add(_reason(status.result))
     return PortState(
-        status=status,
+        status=Status.SUSPENDED_EVSE if is_our_pause else state.status,
         raw=state.name,
         plugged=state.plugged,
         charging=charging,
-        locked=port.locked,
+        locked=status.locked,
         faults=frozenset(faults),
     )
 
 
 def _reason(result: ChargeResult | None) -> Fault:
-    # Aborted, and yet a result that is no error, or none: nobody says why.
+    # Aborted, but the result is no error, or there is none.
     if result is None:
         return Fault.UNKNOWN
     return RESULT_FAULTS.get(result, Fault.UNKNOWN)
 
 
 def box_faults(box: BoxStatus) -> frozenset[Fault]:
-    """Return the faults of the box as a whole, by ``rs``.
+    """Return the faults of the box as a whole, from ``rs``.
 
-    A power backup that never gets its charge could not unlock in a power failure.
+    A power backup that is never charged could not unlock in a power failure.
     """
     failed = BoxFlags.BACKUP_TIMEOUT in box.flags
     return frozenset({Fault.INTERNAL} if failed else ())
 
 
-# -- What may be ordered, and when -------------------------------------------------
+# -- Orders, and the states for them -----------------------------------------------
 
 
 class StartStop(IntEnum):
@@ -180,94 +181,92 @@ class StartStop(IntEnum):
     STOP = 1
     """Stop, and unlock."""
     REQUEST_START = 2
-    """As if key 1 was pressed."""
+    """As if key 1 were pressed."""
     START = 3
-    """Allow the start that was asked for, or start, or go on."""
+    """Allow the start that was requested, or start, or continue."""
     OPTIMISE = 4
     DO_NOT_OPTIMISE = 5
     PAUSE = 6
-    """Stop and stay locked. Where nothing charges it unlocks: sent there only by
-    `commands.unlock`."""
+    """Stop, and keep the plug locked. Without a charge it unlocks: `commands.unlock`."""
     LOCK = 7
 
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """In which states an order is sent."""
+    """The states in which an order is sent."""
 
     states: frozenset[int]
     why: str
-    """What it would do elsewhere, or what it is for."""
+    """Its effect in other states, or its purpose."""
     after_our_pause: frozenset[int] = frozenset()
-    """More states, if it was us who paused this charge."""
+    """More states, if the charge is in a pause of ours."""
 
 
-_RUNNING: Final = frozenset({CHARGING, CHARGING_OPTIMISED, PAUSED, PAUSED_OPTIMISED})
 _OPTIMISABLE: Final = Rule(
-    _RUNNING | {FREE, SEARCHING, WAITING, ENDED},
+    RUNNING | {FREE, SEARCHING, WAITING, ENDED},
     "a port out of order has no next start",
 )
 
 UNLOCKED_BY_6: Final = frozenset({WAITING, ENDED})
-"""Where order 6 does not pause but unlocks."""
+"""Order 6 does not pause here, but unlocks."""
 
 RULES: Final[Mapping[StartStop, Rule]] = {
-    # A stop is sent wherever it may be heard, also in states nobody knows.
+    # A stop may be sent in unknown states too.
     StartStop.STOP: Rule(
         frozenset(range(0x100)) - {STARTING, TEST}, "the box is not ready"
     ),
-    # In 0x10 nobody may be there either: a fixed cable always is (see `state_of`).
+    # In 0x10 there may be no car: a fixed cable is always plugged (see `state_of`).
     StartStop.REQUEST_START: Rule(
-        frozenset({WAITING}), "it would start whoever comes next"
+        frozenset({WAITING}), "it would start the next car that comes"
     ),
     StartStop.START: Rule(
         frozenset({WAITING}),
-        "it would start whoever comes next, or what somebody else has stopped",
+        "it would start the next car, or a charge that was stopped at the box",
         AFTER_OUR_PAUSE,
     ),
     StartStop.OPTIMISE: _OPTIMISABLE,
     StartStop.DO_NOT_OPTIMISE: _OPTIMISABLE,
-    StartStop.PAUSE: Rule(_RUNNING, "where nothing charges it unlocks the plug"),
-    # 3.1.8 locks while a start waits; M165300100 mended it "while charging".
+    StartStop.PAUSE: Rule(RUNNING, "where nothing charges it unlocks the plug"),
+    # 3.1.8 locks while a start waits; firmware M165300100 fixed it "while charging".
     StartStop.LOCK: Rule(
         frozenset({WAITING}), "it locks the plug of a car that waits for its start"
     ),
 }
 
 
-def is_allowed(order: StartStop, status: int, *, paused: bool = False) -> bool:
+def is_allowed(order: StartStop, state: int, *, paused: bool = False) -> bool:
     """Return whether an order may be sent to a port with this status byte.
 
-    ``paused``: we have paused this charge, and nobody has ended it since.
+    ``paused``: it is in a pause of ours, or may be.
     """
     rule = RULES[order]
-    return status in rule.states or (paused and status in rule.after_our_pause)
+    return state in rule.states or (paused and state in rule.after_our_pause)
 
 
-def check_order(order: StartStop, status: int, *, paused: bool = False) -> None:
+def check_order(order: StartStop, state: int, *, paused: bool = False) -> None:
     """Raise NotAvailableError where an order may not be sent (see `is_allowed`)."""
-    if not is_allowed(order, status, paused=paused):
+    if not is_allowed(order, state, paused=paused):
         message = (
-            f"not in state {state_of(status).name}: "
+            f"not in state {state_of(state).name}: "
             f"{order.name.lower().replace('_', ' ')}: {RULES[order].why}"
         )
         raise NotAvailableError(message)
 
 
-def unlocks(seen: PortStatus) -> bool:
+def unlocks(status: PortStatus) -> bool:
     """Return whether order 6 would unlock a locked plug here, and not pause (3.1.8).
 
-    A start that is released is about to charge: then it might do either.
+    With a released start the charge is about to begin: then it might do either.
     """
-    starts = seen.status == WAITING and seen.start is StartRelease.RELEASED
-    return seen.status in UNLOCKED_BY_6 and not starts
+    starts = status.state == WAITING and status.start is StartRelease.RELEASED
+    return status.state in UNLOCKED_BY_6 and not starts
 
 
-def check_unlock(seen: PortStatus) -> None:
+def check_unlock(status: PortStatus) -> None:
     """Raise NotAvailableError where order 6 would not unlock (see `unlocks`)."""
-    if not (seen.locked and unlocks(seen)):
+    if not (status.locked and unlocks(status)):
         message = (
-            f"not in state {state_of(seen.status).name}: unlock: it is for a locked "
-            "plug, and pauses where something charges"
+            f"not in state {state_of(status.state).name}: unlock: it is for a locked "
+            "plug, and pauses a charge under way"
         )
         raise NotAvailableError(message)

@@ -1,4 +1,4 @@
-"""What an EWS-Box tells of its ports: ``rc``, ``rd``.
+"""Records of an EWS-Box about its ports: ``rc``, ``rd``.
 
 Source of the tables: manual, 3.2.4, the command of each. Two ports a box; pairs are
 port 1, port 2. Names and cards are private: no repr shows them.
@@ -19,12 +19,12 @@ _AMPERES: Final = range(81)
 """A control pilot offers no more than 80 A (IEC 61851-1, annex A)."""
 _PERCENT: Final = range(101)
 _WATTS: Final = range(100_001)
-"""Twice what three phases of 70 A carry: a meter counted by pulses may jump."""
+"""Twice the power of three phases of 70 A: a meter counted by pulses may jump."""
 
 
 @record
 class Card:
-    """A card by which somebody has logged in."""
+    """A card that is logged in."""
 
     group: int = coded(Number(width=2), secret=True)
     number: int = coded(Number(width=2), secret=True)
@@ -39,23 +39,23 @@ CARD: Final = Struct(Card, "3.2.4 rc: card")
 
 
 class PortFlags(IntFlag, boundary=KEEP):
-    """What the car has asked for."""
+    """Requests of the car."""
 
     VENTILATION = 1 << 0
 
 
 class StartRelease(IntEnum):
-    """Whether a start was asked for or allowed."""
+    """Whether a start was requested or allowed."""
 
     NONE = 0
-    """Not in the manual; what is left beside 1 and 2."""
+    """Not in the manual, which has 1 and 2 only."""
     REQUESTED = 1
-    """Somebody wants to charge and waits for the server to allow it."""
+    """A start was requested, and waits for the server to allow it."""
     RELEASED = 2
 
 
 class ChargeResult(IntEnum):
-    """How the last charge ended; valid after its end."""
+    """Result of the last charge; valid after its end."""
 
     STOPPED = 1
     PILOT_LOST = 3
@@ -83,9 +83,9 @@ class KeysAndLeds(IntFlag, boundary=KEEP):
 
 @record
 class PortStatus:
-    """What ``rc`` tells of one port; ``None``: a mode 1 port does not know it."""
+    """Status of one port (``rc``); ``None``: not known to a port in mode 1."""
 
-    status: int = coded(Number(width=1))
+    state: int = coded(Number(width=1))
     """Status byte, see `states`."""
     cable_current: int | None = coded(Number(width=1, unit="A", possible=_AMPERES))
     """Rated current of the cable, A; 0: none known."""
@@ -122,17 +122,17 @@ class PortStatus:
     """At the proximity contact, V."""
     keys_and_leds: KeysAndLeds = coded(Flags(kind=KeysAndLeds))
     card: Card | None = coded(optional(CARD), secret=True)
-    """With which somebody has logged in at this port."""
+    """The card that is logged in at this port."""
 
     @property
     def start(self) -> StartRelease | None:
-        """Return whether a start is asked for; ``None``: a code not in the manual."""
+        """Return whether a start was requested or released; ``None``: unknown code."""
         known = self.start_code in StartRelease
         return StartRelease(self.start_code) if known else None
 
     @property
     def result(self) -> ChargeResult | None:
-        """Return how the last charge ended; ``None``: never, or not in the manual."""
+        """Return how the last charge ended; ``None``: no charge, or unknown code."""
         known = self.result_code in ChargeResult
         return ChargeResult(self.result_code) if known else None
 
@@ -160,7 +160,7 @@ def _mode_1(known: Field[object]) -> Field[object]:
 PORT_MODE_1: Final = Struct(
     PortStatus, "3.2.4 rc", tuple(_mode_1(one) for one in PORT.fields)
 )
-"""A port in mode 1 (a household socket): six of the fields mean nothing there."""
+"""A port in mode 1 (a household socket): six of the fields have no meaning there."""
 
 LENGTH_PORTS: Final = 2 * PORT.length
 
@@ -168,11 +168,11 @@ LENGTH_PORTS: Final = 2 * PORT.length
 def decode_ports(
     data: bytes, mode_1: Pair[bool] = (False, False), count: int = 2
 ) -> tuple[PortStatus, ...]:
-    """Return what the answer to ``rc`` says of port 1 and, if there is one, port 2.
+    """Decode the answer to ``rc``: the status of port 1 and, if there is one, port 2.
 
     ``mode_1``: which of them are in mode 1, ``count``: how many there are
-    (`parameters.SystemParameters`); what is told of a port that is not there is not
-    looked at. Raises ImplausibleReplyError.
+    (`parameters.SystemParameters`); bytes of a port that does not exist are ignored.
+    Raises ImplausibleReplyError.
     """
     if len(data) != LENGTH_PORTS:
         message = f"{PORT.source}: {len(data)} bytes, not {LENGTH_PORTS}"
@@ -190,7 +190,7 @@ def decode_ports(
 
 @record
 class Details:
-    """What ``rd`` tells of port 1 and port 2."""
+    """Details of port 1 and port 2 (``rd``)."""
 
     power: Pair[int] = coded(pair(Number(width=4, unit="W", possible=_WATTS)))
     """W. The manual calls it energy; its unit is that of power."""
@@ -201,9 +201,9 @@ class Details:
     cable_code: Pair[int] = coded(pair(Number(width=1)))
     """"Low-level cable current detection in A", raw."""
     limit: Pair[int] = coded(pair(Number(width=1, unit="A")))
-    """As set with ``st``, A; 0: none. Not checked: what is too high is sent again."""
+    """As set with ``st``, A; 0: none. Not checked: one that is too high is sent again."""
     last_card: Pair[Card | None] = coded(pair(optional(CARD)), secret=True)
-    """Who was logged in for the last charge."""
+    """The card of the last charge."""
     last_end: Pair[datetime | None] = coded(pair(Moment()))
     """When the last charge ended, in the box's time zone."""
 
@@ -212,7 +212,7 @@ DETAILS: Final = Struct(Details, "3.2.4 rd")
 
 
 def decode_details(data: bytes) -> Details:
-    """Return what the answer to ``rd`` says; later firmware appends to it.
+    """Decode the answer to ``rd``; later firmware appends to it.
 
     Raises ImplausibleReplyError.
     """
