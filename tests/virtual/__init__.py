@@ -1,4 +1,4 @@
-"""Virtual chargers on a virtual RS-485 bus: the independent witness of the tests.
+"""Virtual chargers on a virtual RS-485 bus: the independent oracle of the tests.
 
 Written from the manuals alone; nothing here imports the integration. Example::
 
@@ -10,7 +10,7 @@ Written from the manuals alone; nothing here imports the integration. Example::
         client = open_my_client(bus.url)              # a path, or socket://127.0.0.1:n
         car.plug_in()
         bus.wait_for(lambda: box.state == "C2")       # or: await bus.wait_for_async(...)
-        box.faults.once("lose")                       # the next reply never comes
+        box.faults.once("lose")                       # the next reply is lost
         bus.unplug(); bus.replug()                    # the adapter
         assert all(r.register != 0x05 for r in requests_in(bus.log.bursts()))
 """

@@ -33,7 +33,7 @@ FIELD_ON, FIELD_OFF = 0b10, 0b01
 
 @dataclass(frozen=True, slots=True)
 class Write:
-    """A write that reached the box: when (real time), what, and what became of it."""
+    """A write received by the box: its real time, its value, and its outcome."""
 
     t: float
     register: int
@@ -43,11 +43,11 @@ class Write:
 
 
 class AblBox(Device):
-    """An ABL wallbox; `outlet` is its inside (states, limits, meter, car).
+    """An ABL wallbox; `outlet` has its states, limits, meter and car.
 
     - `device_id`: 1 to 16; `serial`: 14 characters
-    - `writes`: every write it understood
-    - `answer_register`: told in place of the right register number (a defect)
+    - `writes`: every well-formed write
+    - `answer_register`: sent in place of the right register number (a defect)
     - `unreadable_in_b2`: reports 0x3E8 also in B2; `l3_first`: phase order reversed
     - `sleep_after` (s, None = never), `wake_time`, `wakes_on`: see the README
     """
@@ -78,7 +78,7 @@ class AblBox(Device):
         hardware: int = 0b01,
         name: str = "",
     ) -> None:
-        """Make a box waiting for a car."""
+        """Make a box without a car."""
         super().__init__(name or f"abl-{device_id}")
         self.device_id = device_id
         self.serial = serial
@@ -117,21 +117,21 @@ class AblBox(Device):
         self._configuration = 0
         self._contacted = False
 
-    # What a test looks at, or does
+    # For tests
 
     @property
     def state(self) -> str:
-        """Return the state's name: A1, B2, C2, E0, F4..."""
+        """Return the name of the state: A1, B2, C2, E0, F4..."""
         return self.outlet.state
 
     @property
     def ic_amps(self) -> float:
-        """Return what the car may draw, A per phase (0 = pause)."""
+        """Return the current the car may draw, A per phase (0 = pause)."""
         return self.outlet.ic_amps
 
     @property
     def asleep(self) -> bool:
-        """Tell whether the next request will be lost."""
+        """Return whether the next request will be lost."""
         if self.sleep_after is None:
             return False
         if self._active_at is None:
@@ -145,7 +145,7 @@ class AblBox(Device):
 
     @on_bus_thread
     def power_cycle(self) -> None:
-        """Lose power for a moment: Icmax is Idefault again, a new ID holds."""
+        """Lose power for a moment: Icmax is Idefault again, a new ID takes effect."""
         self._reset()
 
     @on_bus_thread
@@ -170,7 +170,7 @@ class AblBox(Device):
 
     @on_bus_thread
     def set_by_somebody(self, amps: float) -> None:
-        """Let somebody else set Icmax behind the master's back."""
+        """Set Icmax as another master would."""
         self.outlet.set_by_somebody(amps)
 
     def stats(self) -> dict[str, object]:
@@ -192,13 +192,13 @@ class AblBox(Device):
         """Bring the outlet up to now."""
         now = self.now()
         if not self._contacted:
-            # The time without polling is counted from the moment of power-up.
+            # The time without polling counts from power-up.
             self._contacted = True
             self.outlet.contact(now)
         self.outlet.step(now)
 
     def hear(self, segment: Segment) -> None:
-        """Hear bytes; answer a request that is meant for us."""
+        """Receive bytes; reply to a request addressed to this box."""
         if segment.end <= self._deaf_until:
             return
         asleep = self.asleep
@@ -231,7 +231,7 @@ class AblBox(Device):
         self._deaf_until = segment.end + self.wake_time
 
     def _answer(self, request: Request) -> bytes | None:
-        """Return the answer, or None for silence (manual, 1.4.3)."""
+        """Return the reply, or None for silence (manual, 1.4.3)."""
         if request.function == READ:
             return self._read(request)
         if request.function != WRITE:
@@ -279,7 +279,7 @@ class AblBox(Device):
         return self._modify_state(value)
 
     def _configure(self, value: int) -> bool:
-        """Take a new ID and settings; they hold after the next reset."""
+        """Store a new ID and settings; they take effect after the next reset."""
         if self.outlet.state != "E2" or value & 0x0F00:
             return False
         if not 1 <= value & 0xFF <= LAST_ID:
@@ -288,9 +288,9 @@ class AblBox(Device):
         return True
 
     def _modify_state(self, value: int) -> bool:
-        """Obey register 0x05 if the state allows it."""
+        """Execute a value of register 0x05 if the state allows it."""
         if value == RESET:
-            # The answer is still sent; the reset begins after it.
+            # The reset begins after the reply.
             self._schedule_reset()
             return True
         return self.outlet.obey(value)

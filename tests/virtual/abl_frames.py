@@ -42,12 +42,12 @@ def line(start: str, data: bytes) -> bytes:
 def duty_of(amps: float) -> int:
     """Return the duty cycle in 0.1 %, rounded down as in the manual (16 A = 0x10A).
 
-    Annex 3.2. Between 51 A and 52.5 A there is no code: 51 A then.
+    Annex 3.2. A current between 51 A and 52.5 A has no code: 51 A then.
     """
     if amps <= 0:
         return NO_CURRENT
     if amps < 52.5:
-        # A tenth of a billionth keeps 6 A / 0.06 from becoming 99.
+        # Without the 1e-9, 6 A / 0.06 would be 99.
         return min(850, math.floor(amps / 0.06 + 1e-9))
     return min(960, math.floor((amps / 2.5 + 64) * 10 + 1e-9))
 
@@ -65,7 +65,7 @@ def amps_of(duty: int) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A request with a right LRC. `t` is the real time of its end on the wire."""
+    """A request with a correct LRC. `t` is the real time of its end on the wire."""
 
     t: float
     device_id: int
@@ -93,10 +93,10 @@ class Request:
 
 
 class LineFinder:
-    """Finds request lines in what is heard."""
+    """Finds request lines in received bytes."""
 
     def __init__(self) -> None:
-        """Start with nothing."""
+        """Start with an empty buffer."""
         self._line: bytearray | None = None
         self.bad = 0
 
@@ -130,7 +130,7 @@ class LineFinder:
 
 
 def parse(text: bytes, t: float) -> Request | None:
-    """Return the request between `:` and LF, or None if anything is wrong with it."""
+    """Return the request between `:` and LF, or None if it is malformed."""
     if not text.endswith(b"\r") or not _HEX.issuperset(text[:-1]):
         return None
     if len(text) % 2 == 0 or len(text) < 7:
@@ -142,9 +142,9 @@ def parse(text: bytes, t: float) -> Request | None:
 
 
 def requests_in(entries: Iterable[Entry]) -> list[Request]:
-    """Return all well-formed requests in logged traffic, whoever was addressed.
+    """Return all well-formed requests in logged traffic, for any address.
 
-    The witness for a log: `requests_in(bus.log.bursts())`.
+    Use it as the oracle for a log: `requests_in(bus.log.bursts())`.
     """
     result: list[Request] = []
     for entry in entries:

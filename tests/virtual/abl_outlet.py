@@ -1,7 +1,7 @@
-"""The inside of a virtual ABL EVCC2/3: states, limits, meter. No wire.
+"""The outlet of a virtual ABL EVCC2/3: states, limits, meter. No wire.
 
-States and their meaning: manual, annex 3.4. What makes an outlet change its state is
-only partly in the manual; where it is silent, the README says what is assumed.
+States and their meaning: manual, annex 3.4. The manual has only some of the transitions
+between them; the README lists the assumptions for the others.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ CONNECTED = frozenset({"B1", "B2", "C2", "C3", "C4"})
 CHARGING = frozenset({"C2", "C3", "C4"})
 UNREADABLE = 0x3E8
 LOAD_IMBALANCE_DETECTION = 0x3838
-# The manual lets the meter loss cut to 10 A (annex 3.1, LCM); taken for BC3 to BC6.
+# After a meter loss 10 A (annex 3.1, LCM); assumed for BC3 to BC6.
 REDUCED_CURRENT = 10.0
 OVERCURRENT_STEPS = (
     # Above this share of Ic: flag bits, seconds until F9 (register 0x06, bits 2..0).
@@ -29,7 +29,7 @@ OVERCURRENT_STEPS = (
 
 
 class Outlet:
-    """One outlet. Times are the devices' times; plain attributes may be set anywhere.
+    """One outlet, in device time; plain attributes may be set from any thread.
 
     - `en1`, `en2`: the inputs; `enable_input`: configuration bits 1..0 of register 0x02
       (0 none, 1 must be closed for B1->B2, 2 closed = outlet enabled)
@@ -47,7 +47,7 @@ class Outlet:
         upstream_timeout: float = 30.0,
         enable_input: int = 0,
     ) -> None:
-        """Make an outlet waiting for a car."""
+        """Make an outlet, its car not plugged in."""
         self.car = car
         self.default_current = default_current
         self.cable_current = cable_current
@@ -65,10 +65,10 @@ class Outlet:
         self.timeout_triggers_f4 = True
         self.b2_needs_enable_after_power = False
         self.e0_a1_enabled = self.b1_b2_enabled = self.a1_b1_enabled = True
-        # How long B1 lasts, how long F4 lasts after polling began again.
+        # Duration of B1, and of F4 after polling has begun again, s.
         self.b1_time = 0.2
         self.f4_time = 1.0
-        # After so long at 100 % the outlet goes to E0 by itself, as seen on some.
+        # Time at 100 % after which it goes to E0 by itself, as some boxes do, s.
         self.e0_after_pause: float | None = None
         self.ignore_limit = False
         self.shows_c3 = False
@@ -102,24 +102,24 @@ class Outlet:
 
     @property
     def ic_amps(self) -> float:
-        """Return what the car may draw per phase, in A."""
+        """Return the current the car may draw per phase, A."""
         return amps_of(self.ic)
 
     @property
     def reduced(self) -> bool:
-        """Tell whether BC3 to BC6 reduce the duty cycle (only in B and C)."""
+        """Return whether BC3 to BC6 reduce the duty cycle (only in B and C)."""
         return self.state in CONNECTED and (
             self.imbalance or self.meter_failed or self.hot or self.upstream_lost
         )
 
     @property
     def ev_connected(self) -> bool:
-        """Tell whether U_CP is at most 10 V (not valid in states E and F)."""
+        """Return whether U_CP is at most 10 V (not valid in states E and F)."""
         return self.state in CONNECTED
 
     @property
     def phase_currents(self) -> tuple[float, float, float]:
-        """Return the real currents."""
+        """Return the actual currents, A."""
         return self.car.phase_currents if self.car else (0.0, 0.0, 0.0)
 
     @property
@@ -127,7 +127,7 @@ class Outlet:
         """Return bits 2..0 of the flags."""
         return self._over
 
-    # What happens at the outlet
+    # Events at the outlet
 
     def stop_locally(self) -> None:
         """Disable the outlet, as by a key switch."""
@@ -150,7 +150,7 @@ class Outlet:
             self.go("A1")
 
     def set_by_somebody(self, amps: float) -> None:
-        """Let somebody else set Icmax (0 = no current allowed)."""
+        """Set Icmax as another master would (A; 0 = no current allowed)."""
         self.icmax = duty_of(amps)
 
     def go(self, state: str) -> None:
@@ -161,9 +161,9 @@ class Outlet:
             self._recovers_at = None
 
     def obey(self, value: int) -> bool:
-        """Obey a value of register 0x05 (not the reset); False if the state forbids."""
+        """Execute a value of register 0x05 (not the reset); False: not in this state."""
         allowed = {
-            # E0 has no required state in the manual; out of a failure it would hide it.
+            # The manual requires no state for E0; in a failure, E0 would hide it.
             0xE0E0: not self.state.startswith("F"),
             0xF1F1: True,
             0xA1A1: self.state == "E2" or (self.state == "E0" and self.e0_a1_enabled),
@@ -192,19 +192,19 @@ class Outlet:
         self.go("A1")
 
     def contact(self, now: float) -> None:
-        """Note that somebody upstream asked something."""
+        """Take note of a request, for the upstream time-out."""
         self._last_contact = now
         self.upstream_lost = False
         if self.state == "F4" and self._recovers_at is None:
             self._recovers_at = now + self.f4_time
 
     def step(self, now: float) -> None:
-        """Live until now."""
+        """Advance to this time."""
         self._now = now
         self._watch_upstream(now)
         if self.enable_input == 2 and not self.en1 and self.state[0] in "ABC":
             self.go("E0")
-        # From A1 to C2 there are three steps, all of which may be due.
+        # From A1 to C2 there are three transitions, which may all be due.
         for _ in range(3):
             before = self.state
             self._transition(now)

@@ -1,4 +1,4 @@
-"""What a virtual ABL EVCC2/3 answers to reads: the manual's chapter 2 as a table."""
+"""Readable registers of a virtual ABL EVCC2/3: chapter 2 of the manual as a table."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def settings(box: AblBox) -> bytes:
 
 
 def currents(box: AblBox) -> tuple[int, int, int]:
-    """Return Ict1 to Ict3 in 0.1 A, 0x3E8 if there is nothing to tell."""
+    """Return Ict1 to Ict3 in 0.1 A, 0x3E8 where not available."""
     out = box.outlet
     hidden = not out.meter or out.meter_failed or out.state == "A1"
     if hidden or (out.state == "B2" and box.unreadable_in_b2):
@@ -102,7 +102,7 @@ def serial(box: AblBox) -> bytes:
     return b"\x00" + text.ljust(SERIAL_CHARS, b"\x00")
 
 
-# First register -> (number of registers, what follows the register number).
+# First register -> (number of registers, content after the register number).
 BLOCKS: dict[int, tuple[int, Callable[[AblBox], bytes]]] = {
     0x01: (2, identity),
     0x03: (1, modbus_settings),

@@ -1,4 +1,4 @@
-"""The virtual bus: devices, wire, the client's port, and the thread they live on."""
+"""The virtual bus: devices, wire, the client's port, and the thread they run on."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ PARITY_BITS = 11
 class VirtualBus(LoopThread):
     """An RS-485 bus with virtual devices on one end and a port on the other.
 
-    - `url`: what a client opens
+    - `url`: the path or URL that a client opens
     - `log`: all traffic
-    - `faults`: what goes wrong on the whole bus
-    - `devices`: who is on it
+    - `faults`: faults of the whole bus
+    - `devices`: all devices on it
 
     Every method can be called from any thread.
     """
@@ -53,11 +53,11 @@ class VirtualBus(LoopThread):
         ring: int | None = 20_000,
         own_thread: bool = True,
     ) -> None:
-        """Prepare a bus; `start` or `with` brings it to life."""
+        """Prepare a bus; `start` or `with` starts it."""
         super().__init__("virtual-bus", own_thread=own_thread)
         lines = {(d.baud, d.parity) for d in devices} or {(38400, "N")}
         if len(lines) > 1 and (baud is None or parity is None):
-            msg = "devices of different line settings on one bus: say baud and parity"
+            msg = "devices of different line settings on one bus: set baud and parity"
             raise ValueError(msg)
         line = next(iter(lines))
         self.baud = baud or line[0]
@@ -134,7 +134,7 @@ class VirtualBus(LoopThread):
         return self
 
     def stop(self) -> None:
-        """Take the port away and end the thread; raise what went wrong inside."""
+        """Remove the port and end the thread; raise RuntimeError for an error inside."""
         if self.running:
             self.call(self._stop)
             self.stop_thread()
@@ -172,12 +172,12 @@ class VirtualBus(LoopThread):
 
     @property
     def url(self) -> str:
-        """Return what a client opens: a path or a URL, the same after a replug."""
+        """Return the path or URL that a client opens, the same after a replug."""
         return self._url
 
     @property
     def connected(self) -> bool:
-        """Tell whether a client has the port open."""
+        """Return whether a client has the port open."""
         return self._port is not None and self._port.connected
 
     @property
@@ -196,7 +196,7 @@ class VirtualBus(LoopThread):
     # Time
 
     def time(self) -> float:
-        """Return the real time of the wire, in seconds."""
+        """Return the real time of the wire, s."""
         return self.loop.time()
 
     def now(self) -> float:
@@ -207,7 +207,7 @@ class VirtualBus(LoopThread):
 
     @property
     def time_scale(self) -> float:
-        """Return how much faster than real the devices' time runs."""
+        """Return the ratio of the devices' time to real time."""
         return self._scale
 
     @time_scale.setter
@@ -222,7 +222,7 @@ class VirtualBus(LoopThread):
         self.call(change)
 
     def advance(self, seconds: float) -> None:
-        """Let that much of the devices' time pass at once, in small steps."""
+        """Advance the devices' time at once, in small steps."""
 
         def jump() -> None:
             self._step_devices()
@@ -233,7 +233,7 @@ class VirtualBus(LoopThread):
 
         self.call(jump)
 
-    # Who is on the bus, and what else
+    # Devices and other traffic
 
     def add(self, device: Device) -> None:
         """Connect one more device."""
@@ -251,7 +251,7 @@ class VirtualBus(LoopThread):
     def inject(
         self, data: bytes, *, after: float = 0.0, source: str = INJECTED
     ) -> None:
-        """Put somebody else's bytes on the wire, `after` seconds from now."""
+        """Put bytes of another sender on the wire, `after` seconds from now."""
         self.call(lambda: self.wire.send(source, data, self.time() + after))
 
     def foreign_traffic(
@@ -259,7 +259,7 @@ class VirtualBus(LoopThread):
     ) -> None:
         """Let another master send `data` periodically, until `quiet`.
 
-        With `polite` it waits for that much silence first, else it just talks.
+        With `polite` it sends only after that much silence (s), else at any time.
         """
 
         def talk(index: int) -> None:
@@ -276,7 +276,7 @@ class VirtualBus(LoopThread):
         self.call(begin)
 
     def quiet(self) -> None:
-        """End all other masters' traffic."""
+        """End the traffic of all other masters."""
 
         def end() -> None:
             for timer in self._foreign:
@@ -304,7 +304,7 @@ class VirtualBus(LoopThread):
     # For devices, on the bus thread
 
     def send_at(self, device: Device, data: bytes, at: float) -> None:
-        """Send at that time, whatever else is on the wire."""
+        """Send at that time, even if the wire is in use."""
         if at <= self.time():
             self._send_due(device, data)
         else:
@@ -313,7 +313,7 @@ class VirtualBus(LoopThread):
     def send_after_silence(
         self, device: Device, data: bytes, at: float, silence: float
     ) -> None:
-        """Send at that time or later, as soon as the wire was silent so long."""
+        """Send at that time or later, once the wire has been silent for so long."""
         now = self.time()
         free_at = self.wire.audible_until(now) + silence
         if max(at, free_at) <= now:
@@ -379,7 +379,7 @@ class VirtualBus(LoopThread):
     def _send_due(self, device: Device, data: bytes) -> None:
         if device.bus is not self:
             return
-        # However late our timers are: nobody talks over himself.
+        # Timers may be late: a device never sends over its own bytes.
         free_at = self.wire.free_from(device.name) + REPEAT_GAP
         self.wire.send(device.name, data, max(self.time(), free_at))
 

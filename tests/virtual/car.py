@@ -1,4 +1,4 @@
-"""Virtual cars: they come, ask, draw what they may, get full, and leave."""
+"""Virtual cars: they arrive, request charge, draw current, get full, and leave."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ PHASES = 3
 
 @dataclass
 class CarLife:
-    """The automatic life of a car: times in seconds, energy in Wh, all at random.
+    """A car that comes and goes by itself, at random; times in s, energy in Wh.
 
-    Away, plugged but not asking, asking until the wanted energy is in, staying, away.
+    Away, plugged in, requesting until it has the wanted energy, full, away.
     """
 
     seed: int = 0
@@ -28,11 +28,11 @@ class CarLife:
     _next: float | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
-        """Seed the dice."""
+        """Seed the random numbers."""
         self.rng = Random(self.seed)  # noqa: S311 - repeatable on purpose
 
     def step(self, car: Car, now: float) -> None:
-        """Do what is due."""
+        """Do the next step if it is due."""
         if car.requesting:
             return
         if self._next is None:
@@ -53,12 +53,12 @@ class CarLife:
 
 
 class Car:
-    """One car: draws min(what is offered, its own maximum) on one to three phases.
+    """One car: draws min(offered current, its maximum) on one to three phases.
 
     It follows a changed offer after `reaction` seconds, at `max_current` per `ramp`
-    seconds. Offered less than its minimum (or nothing), it stops. `greedy` makes it
-    draw more than offered (1.1 = 10 % too much). `wanted_wh` = None is never full.
-    `asks_without_pwm`: goes on asking (6 V) when the PWM stops; a real car does not.
+    seconds. Below its minimum it stops. `greedy`: factor by which it draws more than
+    offered (1.1 = 10 % too much). `wanted_wh` = None: never full. `asks_without_pwm`:
+    requests (6 V) even when the PWM has stopped; a real car does not.
     The methods may be called from any thread at any time.
     """
 
@@ -100,31 +100,31 @@ class Car:
         self._new_target_at = 0.0
 
     def plug_in(self, *, request: bool = True) -> None:
-        """Arrive and plug in; ask for charge at once unless told otherwise."""
+        """Arrive and plug in; request charge at once unless `request` is False."""
         self.session_wh = 0.0
         self.full = False
         self.plugged = True
         self.requesting = request
 
     def request(self) -> None:
-        """Ask for charge."""
+        """Request charge."""
         self.full = False
         self.requesting = self.plugged
 
     def finish(self) -> None:
-        """Be full: ask no longer, stay plugged."""
+        """Be full: end the request, stay plugged in."""
         self.requesting = False
         self.full = True
 
     def leave(self) -> None:
-        """Unplug and go."""
+        """Unplug and leave."""
         self.plugged = False
         self.requesting = False
         self.current = 0.0
 
     @property
     def phase_currents(self) -> tuple[float, float, float]:
-        """Return the currents of L1, L2, L3 at its socket."""
+        """Return the currents of L1, L2, L3 at its socket, A."""
         result = [0.0] * PHASES
         for index in range(self.phases):
             result[(self.first_phase - 1 + index) % PHASES] = self.current
@@ -138,13 +138,13 @@ class Car:
         )
 
     def accepts(self, offered: float) -> bool:
-        """Tell whether it would close the circuit, or still keeps it closed."""
+        """Return whether it would close the circuit, or still keeps it closed."""
         if not self.plugged or not self.requesting:
             return False
         return offered >= self.min_current or self.current > 0.0
 
     def step(self, now: float, offered: float | None, voltage: float = 230.0) -> float:
-        """Live until `now` with that offer (None: contactor open); return Wh drawn."""
+        """Advance to `now` with this offer, A (None: contactor open); return Wh drawn."""
         if self._last is None:
             self._last = now
             self._new_target_at = now
@@ -166,7 +166,7 @@ class Car:
         self, now: float, seconds: float, offered: float | None, voltage: float
     ) -> float:
         if offered is None or not self.plugged:
-            # The contactor is open: no current, at once, and a fresh start later.
+            # The contactor is open: no current at once, and a new start later.
             self.current = self._target = self._new_target = 0.0
             self._new_target_at = now
             return 0.0

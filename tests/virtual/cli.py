@@ -1,4 +1,4 @@
-"""The shell's way to virtual chargers: `scripts/virtual-chargers`."""
+"""The command line of `scripts/virtual-chargers`."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def _number(device: Device) -> int:
 
 
 def _car(options: argparse.Namespace, index: int) -> Car:
-    """Make the car of one connector; each has its own dice and habits."""
+    """Make the car of one connector; each has its own seed and parameters."""
     life = CarLife(
         seed=options.seed * 1000 + index,
         away=tuple(options.away),

@@ -1,4 +1,4 @@
-"""Commands in words, for the demo and other processes."""
+"""Text commands, for the demo and other processes."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ HELP = (
 
 
 class Control:
-    """Does what a line of text says; answers `ok`, a status, or `error ...`."""
+    """Executes lines of text; replies `ok`, a status, or `error ...`."""
 
     def __init__(self, bus: VirtualBus, say: Callable[[str], None]) -> None:
-        """Control that bus; answers go to `say`."""
+        """Control this bus; replies go to `say`."""
         self._bus = bus
         self._say = say
 
     def do(self, text: str) -> None:
-        """Do one line."""
+        """Execute one line."""
         words = text.split()
         if not words:
             return
@@ -143,7 +143,7 @@ class Control:
 
 
 def describe(bus: VirtualBus) -> str:
-    """Return the state of all chargers, a line each (on the bus thread)."""
+    """Return the state of all chargers, one line each (on the bus thread)."""
     if isinstance(bus, ews_cli.EwsFleet):
         return "\n".join(describe(dialler) for dialler in bus.diallers)
     client = "connected" if bus.connected else "away"

@@ -1,4 +1,4 @@
-"""What all virtual devices have in common."""
+"""Base class of all virtual devices."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 P = ParamSpec("P")
 R = TypeVar("R")
 
-# A device needs a moment between two messages of its own.
+# Pause between two messages of one device, s.
 REPEAT_GAP = 0.001
 
 
@@ -35,18 +35,18 @@ def on_bus_thread(method: Callable[P, R]) -> Callable[P, R]:  # noqa: UP047 - ru
 
 
 class Device:
-    """Something on the bus that hears, thinks, and sometimes answers."""
+    """A device on the bus: receives bytes, keeps state, may reply."""
 
     baud: ClassVar[int] = 38400
     parity: ClassVar[str] = "N"
     protocol: ClassVar[str] = "device"
-    # The silence before a request that the protocol asks of everybody, in seconds.
+    # The silence that the protocol requires before each request, s.
     silence_rule: ClassVar[float] = 0.0
-    # A wire for each direction (RS-232), or one for both (RS-485).
+    # One wire for each direction (RS-232), or one for both (RS-485).
     duplex: ClassVar[bool] = False
 
     def __init__(self, name: str) -> None:
-        """Make a device with a name; the bus makes it unique."""
+        """Make a device; the bus makes its name unique."""
         self.name = name
         self.bus: VirtualBus | None = None
         self.faults = Faults()
@@ -54,11 +54,11 @@ class Device:
         self.replies = 0
 
     def now(self) -> float:
-        """Return the device's time in seconds, faster than real if so scaled."""
+        """Return the device's time, s; faster than real time if scaled."""
         return self.bus.now() if self.bus is not None else 0.0
 
     def hear(self, segment: Segment) -> None:
-        """Hear bytes of somebody else (on the bus thread)."""
+        """Receive bytes of another sender (on the bus thread)."""
 
     def step(self) -> None:
         """Bring the device's state up to now (on the bus thread)."""
@@ -68,9 +68,9 @@ class Device:
         return {"requests": self.requests, "replies": self.replies}
 
     def send(self, data: bytes, turn_round: float, silence: float = 0.0) -> None:
-        """Answer: after the turn-round time, and after that much silence.
+        """Send a reply after the turn-round time, and after that much silence (s).
 
-        The faults of the device and of the bus decide what becomes of it.
+        The faults of the device and of the bus are applied to it.
         """
         bus = self.bus
         if bus is None:

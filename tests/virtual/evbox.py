@@ -40,7 +40,7 @@ class Module:
     min_current: float = 6.0
     energy_wh: float = 0.0
     voltages: Three = (230.0, 230.0, 230.0)
-    # What the reply says instead of the truth, for old captures and for lies.
+    # Values reported in place of the measured ones.
     currents: Three | None = None
     cos_phis: Three | None = None
     offered: float = 0.0
@@ -55,7 +55,7 @@ class Module:
 
 @dataclass
 class Lie:
-    """An implausible answer, with a valid checksum."""
+    """An implausible reply, with valid checksums."""
 
     module: int
     times: int | None
@@ -67,7 +67,7 @@ class Lie:
 
 @dataclass
 class Counters:
-    """What happened to requests."""
+    """Counters of requests, by what became of them."""
 
     accepted: int = 0
     too_soon: int = 0
@@ -82,7 +82,7 @@ class Counters:
 
 @dataclass
 class _Standing:
-    """The order in force, and when it came."""
+    """The order in force, and the time at which it was received."""
 
     limits: Three
     fallback: Three
@@ -94,10 +94,10 @@ class _Standing:
 class EvboxChargePoint(Device):
     """A ChargePoint with up to 20 modules, which share its limit.
 
-    - `orders`: every accepted order; `limits_in_force`, `failed_back`: what is in force
-    - `counters`: what was refused or wrong
+    - `orders`: every accepted order; `limits_in_force`, `failed_back`: the order now
+    - `counters`: refused and malformed requests
     - `serial` can be set: another ChargePoint in its place
-    - `min_interval` (s) is told in the reply and enforced in real time
+    - `min_interval` (s): reported in the reply, and enforced in real time
     """
 
     protocol: ClassVar[str] = "evbox"
@@ -133,11 +133,11 @@ class EvboxChargePoint(Device):
         self._standing: _Standing | None = None
         self._lies: list[Lie] = []
 
-    # What a test looks at, or does
+    # For tests
 
     @property
     def limits_in_force(self) -> Three:
-        """Return the limits that hold now, A per phase, never above the maximum.
+        """Return the limits in force, A per phase, never above the maximum.
 
         "Initially the maximum currents are equal to the maximum rating of the
         connection" (command 68, note **).
@@ -149,12 +149,12 @@ class EvboxChargePoint(Device):
 
     @property
     def silence_violations(self) -> int:
-        """Return how many requests to it came without the silence before them."""
+        """Return the number of requests to it without the required silence before."""
         return self.counters.silence_violations
 
     @property
     def over_limit_requests(self) -> int:
-        """Return how many orders asked for more than the connection has."""
+        """Return the number of orders above the maximum of the connection."""
         return self.counters.over_limit_requests
 
     def lie(
@@ -167,9 +167,9 @@ class EvboxChargePoint(Device):
         voltage: float | None = None,
         energy_jump: float = 0.0,
     ) -> None:
-        """Answer the next `times` requests (None: all) implausibly.
+        """Report implausible values in the next `times` replies (None: all).
 
-        The energy jump is added to the meter told, not to the meter.
+        The energy jump (Wh) is added to the reported total, not to the meter.
         """
         self._lies.append(
             Lie(
@@ -183,7 +183,7 @@ class EvboxChargePoint(Device):
         )
 
     def honest(self) -> None:
-        """End all lies."""
+        """Report measured values again."""
         self._lies.clear()
 
     @on_bus_thread
@@ -200,12 +200,12 @@ class EvboxChargePoint(Device):
 
     @on_bus_thread
     def remove_module(self, index: int = -1) -> Module:
-        """Take a module away; those behind it move up."""
+        """Remove a module; those behind it move up."""
         return self.modules.pop(index)
 
     @on_bus_thread
     def power_cycle(self) -> None:
-        """Lose everything that was ordered."""
+        """Lose the order in force."""
         self._standing = None
         self.failed_back = False
 
@@ -216,12 +216,12 @@ class EvboxChargePoint(Device):
     # On the bus
 
     def hear(self, segment: Segment) -> None:
-        """Hear bytes; answer a request that is meant for us."""
+        """Receive bytes; reply to a request addressed to this box."""
         for heard in self._finder.feed(segment):
             self._heard(heard)
 
     def step(self) -> None:
-        """Time out, share the limit among the modules, let the cars draw."""
+        """Time out, share the limit among the modules, advance the cars."""
         now = self.now()
         standing = self._standing
         if (
@@ -279,7 +279,7 @@ class EvboxChargePoint(Device):
         self.failed_back = False
         self.step()
         jitter = self.bus.rng.random() * self.jitter if self.bus else 0.0
-        # The silence is counted from the request's end, so that is the least wait.
+        # The silence counts from the end of the request, so it is the least wait.
         self.send(frame(self._reply(request)), self.turn_round, SILENCE + jitter)
 
     def _reply(self, request: Order) -> str:
@@ -322,8 +322,8 @@ class EvboxChargePoint(Device):
     def _share(self) -> None:
         """Share the limit: equal parts, and none below a module's minimum.
 
-        Which module goes without, when there is not enough for all, is not in the
-        manual: here the last one.
+        If it is not enough for all, the last module gets nothing; the manual does not
+        define which one.
         """
         limits = self.limits_in_force
         asking = []

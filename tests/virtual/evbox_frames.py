@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from .log import Entry
     from .wire import Segment
 
-# Timers of a computer and of a box are not the same: nobody is blamed for this much.
+# Timers of a computer and of a box differ: less silence by this much (s) is accepted.
 SILENCE_TOLERANCE = 0.001
 STX = 0x02
 ETX = 0x03
@@ -75,10 +75,10 @@ class Order:
 
 
 class FrameFinder:
-    """Finds frames in what is heard; a new STX drops what came before it."""
+    """Finds frames in received bytes; a new STX drops the bytes before it."""
 
     def __init__(self) -> None:
-        """Start with nothing."""
+        """Start with an empty buffer."""
         self._chars = bytearray()
         self._inside = False
         self._silence = 0.0
@@ -129,7 +129,7 @@ def checked(text: str) -> str | None:
 
 
 def order(body: str, t: float) -> Order | None:
-    """Decode a checked request from the SmartGrid module; None if it is none."""
+    """Decode a checked request of the SmartGrid module; None for another text."""
     command = body[4:6]
     data = body[HEADER_CHARS:]
     if body[:2] != CHARGEPOINT or body[2:4] != SMARTGRID:
@@ -156,9 +156,9 @@ def order(body: str, t: float) -> Order | None:
 
 
 def orders_in(entries: Iterable[Entry]) -> list[Order]:
-    """Return all well-formed requests in logged traffic, whoever was addressed.
+    """Return all well-formed requests in logged traffic, for any address.
 
-    The witness for a log: `orders_in(bus.log.bursts())`.
+    Use it as the oracle for a log: `orders_in(bus.log.bursts())`.
     """
     result: list[Order] = []
     for entry in entries:
@@ -174,7 +174,7 @@ def orders_in(entries: Iterable[Entry]) -> list[Order]:
 
 
 def rude_requests(entries: Iterable[Entry], silence: float = 0.1) -> list[Entry]:
-    """Return the client's frames that began without the silence before them.
+    """Return the client's frames that began without the required silence before.
 
     "The module needs to verify the bus is available for at least 100 ms" (Topology).
     """

@@ -53,14 +53,14 @@ CAR_BITS = (0b100, 0b010)
 class EwsBox(EwsHands):
     """An EWS-Box with two charging ports (`ports[0]` is car 1).
 
-    - `commands`, `writes`, `currents_set`, `infos`: what was heard and told
+    - `commands`, `writes`, `currents_set`, `infos`: commands received, records sent
     - `mode`, `rfid`, `manual_io`, `exclusive`: the system mode; see also `system`,
       `user`, `user_info`, `extra`, `cards`: the stored parameters
-    - `drivers`: who press the start key when their cars want to charge
+    - `drivers`: people that press the start key when their cars request charge
     - `masking`: how `rp` and `ru` hide passwords; `bcc`: how it counts the BCC
-    - `ignores_limits`: takes an `st` without effect; `clamps_limits`: takes one that is
-      too high as the highest possible; `unanswered`: names that get no answer
-    - `restart_flag_until`: what takes bit 0 of `rs` away: "read", "clock" or "never"
+    - `ignores_limits`: accepts `st` without effect; `clamps_limits`: accepts one that is
+      too high as the highest possible; `unanswered`: commands without an answer
+    - `restart_flag_until`: the event that clears bit 0 of `rs`: "read", "clock", "never"
     """
 
     baud: ClassVar[int] = 115200
@@ -148,38 +148,38 @@ class EwsBox(EwsHands):
         self._timed_out_at: dict[int, float] = {}
         self.take_parameters()
 
-    # What a test looks at
+    # For tests
 
     @property
     def bcc(self) -> Bcc:
-        """Return how the BCC is counted."""
+        """Return the bytes that the BCC covers."""
         return self.frames.bcc
 
     @bcc.setter
     def bcc(self, bcc: Bcc) -> None:
-        """Count it otherwise from now on."""
+        """Let it cover other bytes from now on."""
         self.frames.bcc = bcc
 
     @property
     def initialising(self) -> bool:
-        """Tell whether it is in 0xF0."""
+        """Return whether it is in 0xF0."""
         return self.ports[0].status == Status.INIT
 
     @property
     def server_connected(self) -> bool:
-        """Tell whether it counts as connected: by TCP, or by commands."""
+        """Return whether it counts as connected: by TCP, or by commands."""
         if self.network:
             return self.link_up
         return self.requests > 0 and self.silent_for < COMMAND_TIMEOUT
 
     @property
     def silent_for(self) -> float:
-        """Return for how long no command has come, s."""
+        """Return the time since the last command, s."""
         return self.now() - self._heard_at
 
     @property
     def card_counts_as_valid(self) -> bool:
-        """Tell what the flag of `rs` says; over Ethernet it is not checked."""
+        """Return the flag of `rs`; over Ethernet the card is not checked."""
         card = self.reader.noted
         if card is None or self.network:
             return card is not None
@@ -193,7 +193,7 @@ class EwsBox(EwsHands):
         return base + timedelta(seconds=self.now() - at)
 
     def commands_named(self, *names: str) -> list[EwsCommand]:
-        """Return the commands of these kinds, oldest first."""
+        """Return the commands of these names, oldest first."""
         return [c for c in self.commands if c.name in names]
 
     def stats(self) -> dict[str, object]:
@@ -214,7 +214,7 @@ class EwsBox(EwsHands):
     # On the bus
 
     def step(self) -> None:
-        """Bring the ports up to now; look at the server's time-out."""
+        """Bring the ports up to now; check the server time-out."""
         now = self.now()
         if self._power_on_at is not None and now >= self._power_on_at:
             self._power_on_at = None
@@ -230,7 +230,7 @@ class EwsBox(EwsHands):
         self._tell_events()
 
     def hear(self, segment: Segment) -> None:
-        """Hear bytes; answer commands."""
+        """Receive bytes; answer commands."""
         if not self.powered or segment.sources != (CLIENT,):
             return
         for message in self.frames.feed(segment):
@@ -238,7 +238,7 @@ class EwsBox(EwsHands):
                 self._command(message)
 
     def link_changed(self, *, up: bool) -> None:
-        """Take note that the TCP connection is up or down (a dialler's call)."""
+        """Take note that the TCP connection is up or down (called by a dialler)."""
         self.link_up = up
         self.frames.reset()
         if up:
@@ -247,7 +247,7 @@ class EwsBox(EwsHands):
     # For the commands
 
     def take_parameters(self) -> None:
-        """Let the ports know what the parameters say."""
+        """Pass the parameters on to the ports."""
         system = self.system
         limits = (system.max_current, self.extra.max_current_2 or system.max_current)
         for port in self.ports:
@@ -272,11 +272,11 @@ class EwsBox(EwsHands):
         self._clock = (self.now(), now)
 
     def limit_sent(self, port: int, amps: int, *, accepted: bool) -> None:
-        """Note an `st`."""
+        """Record an `st`."""
         self.currents_set.append(EwsLimit(self._time(), port, amps, accepted))
 
     def reset_after_answer(self) -> None:
-        """Reset the processor as soon as the answer is out."""
+        """Reset the processor as soon as the answer was sent."""
         if self.bus is not None:
             out = self.turn_round + self.jitter + 20 * self.bus.byte_time
             self.bus.loop.call_later(out, self._reset)
@@ -329,12 +329,12 @@ class EwsBox(EwsHands):
         return lambda: self._event(bit, {})
 
     def _event(self, bits: int, keys: dict[int, int]) -> None:
-        """Note something for the next info record."""
+        """Add an event to the next info record."""
         self._bits |= bits
         self._keys.update(keys)
 
     def _tell_events(self) -> None:
-        """Send what was noted, if there is a server that can hear it."""
+        """Send the pending events, if the server is connected."""
         if not (self._bits or self._keys) or self.bus is None or not self.powered:
             return
         if not self.system.has(SystemMode.SERVER):
@@ -348,7 +348,7 @@ class EwsBox(EwsHands):
         self.send_raw(self._record(bits, keys))
 
     def _block_ports(self) -> None:
-        """Let the port in use block the other one; look for the reader."""
+        """Let the port in use block the other one; check for the reader."""
         exclusive = self.system.has(SystemMode.EXCLUSIVE) and self.system.ports == 2
         missing = self.system.has(SystemMode.RFID) and not self.reader.fitted
         for port, other in zip(self.ports, reversed(self.ports), strict=True):
@@ -389,11 +389,11 @@ class EwsBox(EwsHands):
         if not self.clock_survives:
             self._clock = (now, POWER_UP_CLOCK)
         self.initialise()
-        self.on_power(True)  # noqa: FBT003 - the only thing it says
+        self.on_power(True)  # noqa: FBT003 - a callback
 
     def _reset(self) -> None:
         if not self.powered:
             return
         self._lose_power(mains=False)
-        self.on_power(False)  # noqa: FBT003 - the only thing it says
+        self.on_power(False)  # noqa: FBT003 - a callback
         self._boot()

@@ -1,4 +1,4 @@
-"""The shell's way to virtual EWS-Boxes: arguments, many diallers, commands."""
+"""The command line of virtual EWS-Boxes: arguments, fleets of diallers, commands."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ FIRST_SERIAL = 12345678901
 
 
 class EwsFleet:
-    """Many boxes that dial the same server, on one thread, handled like one bus."""
+    """Many boxes that dial the same server, on one thread, used like one bus."""
 
     def __init__(
         self,
@@ -62,7 +62,7 @@ class EwsFleet:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Hang up; the thread is the first one's and ends with it."""
+        """Hang up; the thread belongs to the first dialler and ends with it."""
         for dialler in reversed(self.diallers):
             dialler.stop()
 
@@ -76,7 +76,7 @@ class EwsFleet:
         return self.diallers[0].call(function)
 
     def unplug(self) -> None:
-        """Pull the network cable of all."""
+        """Pull the network cable of all boxes."""
         for dialler in self.diallers:
             dialler.unplug()
 
@@ -86,12 +86,12 @@ class EwsFleet:
             dialler.replug()
 
     def advance(self, seconds: float) -> None:
-        """Let time pass for all."""
+        """Advance the time of all boxes."""
         for dialler in self.diallers:
             dialler.advance(seconds)
 
     def stats(self) -> dict[str, object]:
-        """Return the counters of all."""
+        """Return the counters of all boxes."""
         return {
             "url": self.url,
             "attempts": sum(dialler.attempts for dialler in self.diallers),
@@ -106,13 +106,13 @@ def add_arguments(add: Callable[..., object]) -> None:
     add("--dial", metavar="HOST:PORT", help="the boxes dial this server")
     add("--retry", type=float, default=0.5, metavar="S", help="between two attempts")
     add("--serials", nargs="+", metavar="SERIAL", help="12 digits each")
-    add("--count", type=int, default=1, help="so many boxes, if without --serials")
+    add("--count", type=int, default=1, help="number of boxes, without --serials")
     add("--jumper", type=int, default=32, choices=[13, 20, 32, 63, 70])
-    add("--max-current", type=int, default=0, metavar="A", help="0 = the jumper's")
-    add("--drivers", action="store_true", help="press start when a car wants to charge")
+    add("--max-current", type=int, default=0, metavar="A", help="0: that of the jumper")
+    add("--drivers", action="store_true", help="press start when a car requests charge")
     add("--standalone", action="store_true", help="not in server mode")
     add("--rfid", action="store_true", help="with card authentication")
-    add("--manual-io", action="store_true", help="keys and LEDs are the server's")
+    add("--manual-io", action="store_true", help="the server handles keys and LEDs")
     add("--exclusive", action="store_true", help="one port at a time")
     add("--fixed-cable", action="store_true")
     add("--fan", action="store_true", help="with ventilation")
@@ -125,12 +125,12 @@ def boxes(
     options: argparse.Namespace,
     car: Callable[[argparse.Namespace, int], Car],
 ) -> list[Device]:
-    """Make the boxes that were asked for, with two cars each."""
+    """Make the boxes of these arguments, with two cars each."""
     serials = options.serials or [
         f"{FIRST_SERIAL + number:012d}" for number in range(options.count)
     ]
     if len(serials) > 1 and not options.dial:
-        msg = "one box a serial line: several boxes can only --dial"
+        msg = "a serial line has one box: several boxes need --dial"
         raise SystemExit(msg)
     made = [
         EwsBox(
@@ -162,7 +162,7 @@ def boxes(
 def fleet(
     options: argparse.Namespace, devices: list[Device], settings: dict[str, object]
 ) -> VirtualBus:
-    """Let the boxes dial; the result does all that the script asks of a bus."""
+    """Return a fleet of these boxes; it has all of a bus that the script uses."""
     host, _, port = options.dial.rpartition(":")
     chosen = {
         key: value for key, value in settings.items() if key not in ("baud", "parity")
@@ -178,7 +178,7 @@ def fleet(
 
 
 def command(box: EwsBox, word: str, port: int, values: list[str]) -> bool:
-    """Do a command of the control's; False if it is not one of a box."""
+    """Execute a control command; return False if it is none of a box."""
     charging_port = box.ports[port - 1]
     if word == "press":
         seconds = float(values[1]) if len(values) > 1 else 0.3
@@ -211,7 +211,7 @@ def command(box: EwsBox, word: str, port: int, values: list[str]) -> bool:
 
 
 def describe_box(box: EwsBox) -> str:
-    """Return the state of both ports in words."""
+    """Return the state of both ports as text."""
     parts = []
     for port in box.ports:
         marks = "".join(

@@ -1,4 +1,4 @@
-"""A server of bare sockets for a virtual EWS-Box: what it is tested with."""
+"""A server of bare sockets, for the tests of the virtual EWS-Box."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ PORT_FIELDS = (
 
 
 class EwsClient:
-    """Asks a box, on its serial line or on the connection it opened."""
+    """Sends commands to a box, on its serial line or the connection it opened."""
 
     def __init__(self, line: RawClient | socket.socket, bcc: Bcc = "all") -> None:
-        """Take an open line; it is closed with this."""
+        """Take an open line; it is closed with this client."""
         self._line = line
         self._bcc: Bcc = bcc
         self._reader = FrameReader(10.0, bcc)
@@ -63,7 +63,7 @@ class EwsClient:
             self._line.sendall(data)
 
     def read(self, timeout: float = 1.0) -> bytes:
-        """Return what comes next, b"" at the time-out or the end."""
+        """Return the next bytes, b"" at the time-out or the end."""
         if isinstance(self._line, RawClient):
             return self._line.read(1, timeout)
         self._line.settimeout(timeout)
@@ -85,7 +85,7 @@ class EwsClient:
         return self._waiting.pop(0)
 
     def ask(self, name: str, parameters: bytes = b"", timeout: float = 1.0) -> bytes:
-        """Send a command and return its answer's data; b"?" if none comes."""
+        """Send a command and return the data of its answer; b"?" without one."""
         self.write(command(name, parameters, self._bcc))
         while True:
             message = self.next(timeout)
@@ -104,7 +104,7 @@ class EwsClient:
         return self.ask("st", bytes((port, amps)))[0]
 
     def ports(self) -> list[dict[str, int]]:
-        """Ask for `rc`, field by field."""
+        """Return the fields of `rc` for each port."""
         data = self.ask("rc")
         size = PORT_STATUS.size
         return [

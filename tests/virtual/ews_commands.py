@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 LONGEST_WRITE = 1024
 ERASED = 0xFF
 
-# What changes something at the box.
+# Commands that change something at the box.
 WRITING = frozenset(
     {"cr", "fw", "ma", "mc", "oe", "ow", "sc", "se"}
     | {"sf", "si", "sl", "sp", "st", "su", "sz", "zz"}
@@ -42,7 +42,7 @@ def set_meter(box: EwsBox, parameters: bytes) -> bytes:
 
 
 def accept_card(box: EwsBox, parameters: bytes) -> bytes:
-    """`ma`: take the noted card as valid."""
+    """`ma`: accept the noted card as valid."""
     answer = box.reader.accept(parameters, box.now())
     if answer == OK:
         box.user_interface.card_is_valid()
@@ -61,7 +61,7 @@ def erase(box: EwsBox, parameters: bytes) -> bytes:
 
 
 def write_rom(box: EwsBox, parameters: bytes) -> bytes:
-    """`ow`: write into the temp ROM; flash that was not erased cannot take it."""
+    """`ow`: write into the temp ROM; only erased flash can be written."""
     if len(parameters) < 8:
         return code(REFUSED)
     start, count = struct.unpack(">II", parameters[:8])
@@ -75,7 +75,7 @@ def write_rom(box: EwsBox, parameters: bytes) -> bytes:
 
 
 def activate(box: EwsBox, parameters: bytes) -> bytes:
-    """`fw`: take the firmware at address 0, if there is any; charges end normally."""
+    """`fw`: activate firmware at address 0, if there is any; charges end normally."""
     if parameters or not any(byte != ERASED for byte in box.rom[:LONGEST_WRITE]):
         return code(REFUSED)
     box.activated.append(bytes(box.rom).rstrip(bytes((ERASED,))))
@@ -87,7 +87,7 @@ def activate(box: EwsBox, parameters: bytes) -> bytes:
 
 
 def reset(box: EwsBox, _parameters: bytes) -> bytes:
-    """`zz`: reset once the answer is out."""
+    """`zz`: reset once the answer was sent."""
     box.reset_after_answer()
     return b""
 
@@ -101,7 +101,7 @@ def read_system_status(box: EwsBox, _parameters: bytes) -> bytes:
 
 
 def set_clock(box: EwsBox, parameters: bytes) -> bytes:
-    """`sc`: local time, as `rs` tells it."""
+    """`sc`: local time, as in `rs`."""
     if len(parameters) != ews_status.CLOCK.size:
         return code(REFUSED)
     try:
@@ -138,7 +138,7 @@ def write_system(box: EwsBox, parameters: bytes) -> bytes:
 
 
 def limit_current(box: EwsBox, parameters: bytes) -> bytes:
-    """`st`: car, amperes; 0 takes the limit away."""
+    """`st`: car, amperes; 0 removes the limit."""
     if len(parameters) != 2 or parameters[0] not in (1, 2):
         return code(REFUSED)
     number, amps = parameters

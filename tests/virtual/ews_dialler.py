@@ -1,7 +1,7 @@
 """A virtual EWS-Box on the network: the box is the TCP client and dials its server.
 
-It tries for ever, from ten source ports in turn; after 30 s without a command it closes
-the connection and dials anew (manual, 3.1.4.2).
+It retries for ever, from ten source ports in turn; after 30 s without a command it
+closes the connection and dials again (manual, 3.1.4.2).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from .ews_box import EwsBox
     from .ports import Port
 
-# A network has no byte times worth the name, but the wire needs one.
+# The byte time of a network is negligible, but the wire needs one.
 NETWORK_BAUD = 1_000_000
 SOURCE_PORTS = 10
 FIRST_SOURCE_PORT = 20_000
@@ -27,12 +27,12 @@ LAST_SOURCE_PORT = 32_000
 
 
 class EwsDialler(VirtualBus):
-    """A box that dials `host:port`; else like any virtual bus: `log`, `faults`, ...
+    """A box that dials `host:port`; otherwise a virtual bus: `log`, `faults`, ...
 
     - `retry`: real seconds between two attempts; `source_ports`: the first of ten, 0 =
       any (default: from the box's serial number)
-    - `dropped`: why connections ended, oldest first
-    - `on`: another dialler, to live on its thread
+    - `dropped`: reasons why connections ended, oldest first
+    - `on`: another dialler, to run on its thread
     - `pace`: (bytes, real seconds) to send slowly
     """
 
@@ -59,7 +59,7 @@ class EwsDialler(VirtualBus):
             source_ports = FIRST_SOURCE_PORT + number * SOURCE_PORTS
         box.user.own_port = source_ports
         if not box.system.has(SystemMode.SERVER):
-            msg = "a box in standalone mode dials nobody"
+            msg = "a box in standalone mode does not dial"
             raise ValueError(msg)
         box.user.server_ip = socket.inet_aton(socket.gethostbyname(host))
         box.user.server_port = port
@@ -83,7 +83,7 @@ class EwsDialler(VirtualBus):
         options.setdefault("baud", NETWORK_BAUD)
         super().__init__((box,), make, **options)  # type: ignore[arg-type]
 
-    # What a test looks at, or does
+    # For tests
 
     @property
     def dial_port(self) -> DialPort:
@@ -95,7 +95,7 @@ class EwsDialler(VirtualBus):
 
     @property
     def attempts(self) -> int:
-        """Return how often it has dialled."""
+        """Return the number of times it has dialled."""
         return self._dial_port.attempts if self._dial_port else 0
 
     @property
@@ -105,12 +105,12 @@ class EwsDialler(VirtualBus):
 
     @property
     def pace(self) -> tuple[int, float] | None:
-        """Return how slowly it sends: bytes at a time, seconds between."""
+        """Return its pace: bytes at a time, seconds between; None: at once."""
         return self.dial_port.pace
 
     @pace.setter
     def pace(self, pace: tuple[int, float] | None) -> None:
-        """Send otherwise from now on."""
+        """Change the pace from now on."""
         self.dial_port.pace = pace
 
     def hang_up(self, *, redial: bool = True) -> None:
@@ -118,7 +118,7 @@ class EwsDialler(VirtualBus):
         self.call(lambda: self._drop("hung up", redial=redial))
 
     def vanish(self, *, redial: bool = True) -> None:
-        """Leave the connection half-open: nothing is ever heard of it again."""
+        """Leave the connection half-open: no byte ever comes again."""
         self.call(lambda: self._drop("vanished", silent=True, redial=redial))
 
     def dial(self) -> None:
@@ -129,7 +129,7 @@ class EwsDialler(VirtualBus):
         """Reset the connections that were left half-open."""
         self.call(self.dial_port.bury_ghosts)
 
-    # One thread for many
+    # One thread for many diallers
 
     def start_thread(self) -> None:
         """Start a thread, or use the other dialler's."""
@@ -158,7 +158,7 @@ class EwsDialler(VirtualBus):
         self.dial_port.hang_up(silent=silent, redial=redial)
 
     def _power(self, on: bool) -> None:  # noqa: FBT001 - a callback
-        """Lose the connection as a box without power does: without a word."""
+        """Lose the connection as a box without power does: silently."""
         if on:
             self.dial_port.dial_later()
         else:

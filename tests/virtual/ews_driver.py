@@ -1,4 +1,4 @@
-"""A driver at a virtual EWS-Box: presses start, and stop and start again in vain."""
+"""A driver at a virtual EWS-Box: presses start; without success, stop and start."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ STEP_BACK = 5.0
 
 @dataclass
 class Driver:
-    """Whoever comes with the car of one port; times in device seconds.
+    """The driver of the car at one port; times in device seconds.
 
-    In server mode the start key only asks the server. Somebody who is not answered
-    for so long takes the request back, and asks anew.
+    In server mode the start key only sends a request to the server. After `patience`
+    without a start the driver withdraws the request, and makes it again.
     """
 
     port: EwsPort
@@ -33,11 +33,11 @@ class Driver:
     _next: float | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
-        """Seed the dice."""
+        """Seed the random numbers."""
         self.rng = Random(self.seed)  # noqa: S311 - repeatable on purpose
 
     def step(self, now: float, keys: UserInterface) -> None:
-        """Do what is due."""
+        """Do the next step if it is due."""
         port = self.port
         wants = port.car is not None and port.car.requesting
         if not wants or port.status != Status.WAITING:

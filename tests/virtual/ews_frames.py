@@ -1,4 +1,4 @@
-"""MCS binary frames, as the manual's section 3.2.2 has them.
+"""MCS binary frames (manual, 3.2.2).
 
 STX (0x02), parameter length (16 bit, big-endian), message id, parameters, BCC.
 """
@@ -24,7 +24,7 @@ Bcc = Literal["all", "without_msgid"]
 
 
 def bcc_of(length: bytes, msgid: bytes, parameters: bytes, bcc: Bcc) -> int:
-    """Return the XOR over "Laenge + Nutzdaten"; whether the id counts is unclear."""
+    """Return the XOR over "Laenge + Nutzdaten", with the id or without: unclear."""
     counted = (
         length + parameters
         if bcc == "without_msgid"
@@ -50,7 +50,7 @@ def command(name: str, parameters: bytes = b"", bcc: Bcc = "all") -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A frame that was heard: real time of its last byte, id, parameters."""
+    """A frame received: real time of its last byte, id, parameters."""
 
     t: float
     msgid: bytes
@@ -63,13 +63,13 @@ class Message:
 
     @property
     def data(self) -> bytes:
-        """Return what follows the command id."""
+        """Return the bytes after the command id."""
         return self.parameters[2:]
 
 
 @dataclass(slots=True)
 class FrameCounters:
-    """What was wrong with the bytes heard."""
+    """Counters of errors in the bytes received."""
 
     bad_bcc: int = 0
     timeouts: int = 0
@@ -78,7 +78,7 @@ class FrameCounters:
 
 
 class FrameReader:
-    """Takes bytes, gives messages; drops a frame whose bytes pause too long."""
+    """Finds messages in bytes; drops a frame with too long a pause in it."""
 
     def __init__(self, timeout: float = RS232_TIMEOUT, bcc: Bcc = "all") -> None:
         """Wait for an STX."""
@@ -90,15 +90,15 @@ class FrameReader:
 
     @property
     def partial(self) -> bytes:
-        """Return what has come of an unfinished frame."""
+        """Return the bytes of an unfinished frame."""
         return bytes(self._partial)
 
     def reset(self) -> None:
-        """Forget an unfinished frame."""
+        """Drop an unfinished frame."""
         self._partial.clear()
 
     def feed(self, segment: Segment) -> list[Message]:
-        """Take bytes that came in a row; return the messages complete now."""
+        """Take bytes received in a row; return the messages complete now."""
         if self._partial and segment.start - self._last_end > self.timeout:
             self.counters.timeouts += 1
             self._partial.clear()
@@ -114,7 +114,7 @@ class FrameReader:
     def _take(self, byte: int, at: float) -> Message | None:
         partial = self._partial
         if not partial and byte != STX:
-            # "Aufwecken mit allen Zeichen != STX": between frames they mean nothing.
+            # "Aufwecken mit allen Zeichen != STX": between frames they have no meaning.
             self.counters.skipped_bytes += 1
             return None
         partial.append(byte)
@@ -139,7 +139,7 @@ class FrameReader:
 def messages_in(entries: list[Entry], bcc: Bcc = "all") -> list[Message]:
     """Return the messages in logged transmissions of one source, in their order.
 
-    For a test that asks the log what a client really sent: broken frames are left out.
+    Malformed frames are left out.
     """
     messages = []
     partial = b""

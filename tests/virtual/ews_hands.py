@@ -1,4 +1,4 @@
-"""What a person, the house, or the mains does to a virtual EWS-Box."""
+"""Events at a virtual EWS-Box from outside: by a person, the house or the mains."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ROM_SIZE = 3 * 0x10000
 
 
 class EwsHands(Device):
-    """The part of a box that is touched from outside. Any thread may call it."""
+    """The part of a box that is operated from outside, from any thread."""
 
     ports: tuple[EwsPort, EwsPort]
     user_interface: UserInterface
@@ -44,14 +44,14 @@ class EwsHands(Device):
     bcc: Bcc
 
     def __init__(self, name: str) -> None:
-        """Be switched on."""
+        """Make a box that is switched on."""
         super().__init__(name)
         self.on_power: Callable[[bool], None] = lambda _on: None
         self.powered = True
         self.restarted = True
         self.restarts = 0
         self.server_timeouts = 0
-        # The temp ROM's sectors 0 to 2; their size is not told.
+        # Sectors 0 to 2 of the temp ROM; the manual does not give their size.
         self.rom = bytearray(b"\xff" * ROM_SIZE)
         self.activated: list[bytes] = []
         self.commands: list[EwsCommand] = []
@@ -83,19 +83,19 @@ class EwsHands(Device):
 
     @on_bus_thread
     def key_up(self, port: int, key: int) -> None:
-        """Let it go."""
+        """Release it."""
         self.user_interface.key_up(port, key, self.now())
         self.step()
 
     @on_bus_thread
     def present_card(self, card: Card | None = None) -> None:
-        """Hold a card to the reader."""
+        """Present a card to the reader."""
         self.user_interface.present_card(card or Card(), self.now())
         self.step()
 
     @on_bus_thread
     def remove_card(self) -> None:
-        """Take it away again."""
+        """Remove the card."""
         self.reader.remove_card()
 
     @on_bus_thread
@@ -106,7 +106,7 @@ class EwsHands(Device):
 
     @on_bus_thread
     def stop_on_web_page(self, port: int) -> None:
-        """Press stop there."""
+        """Press stop on the box's own web page."""
         self.user_interface.stop_on_web_page(self.ports[port - 1])
         self.step()
 
@@ -118,13 +118,13 @@ class EwsHands(Device):
 
     @on_bus_thread
     def power_off(self) -> None:
-        """Take the mains away: contactors and locks open, `st` is forgotten."""
+        """Switch the mains off: contactors and locks open, the limit of `st` is lost."""
         self._lose_power(mains=True)
-        self.on_power(False)  # noqa: FBT003 - the only thing it says
+        self.on_power(False)  # noqa: FBT003 - a callback
 
     @on_bus_thread
     def power_on(self) -> None:
-        """Give the mains back."""
+        """Switch the mains on."""
         if not self.powered:
             self._boot()
 
@@ -135,7 +135,7 @@ class EwsHands(Device):
         self._power_on_at = self.now() + seconds
         self.step()
 
-    # What else a box may send
+    # Other frames of a box
 
     @on_bus_thread
     def send_raw(self, data: bytes) -> None:
@@ -145,7 +145,7 @@ class EwsHands(Device):
             self.bus.send_at(self, data, self.bus.time())
 
     def _send_cut(self, first: bytes, rest: bytes, pause: float) -> None:
-        """Send the first lump, and the second one after a pause."""
+        """Send the first part, and the second one after a pause."""
         if self.bus is None or not self.powered or self.faults.dead:
             return
         self._send_rest()
@@ -156,14 +156,14 @@ class EwsHands(Device):
             self._rest = (timer, rest)
 
     def _send_rest(self) -> None:
-        """Send what was cut off; at once if something else is to be sent."""
+        """Send the pending rest; at once, if other bytes are to be sent."""
         rest, self._rest = self._rest, None
         if rest is not None and self.bus is not None:
             rest[0].cancel()
             self.bus.send_at(self, rest[1], self.bus.time())
 
     def send_debug(self, text: bytes = b"debug") -> None:
-        """Send a 'D' message: for nobody."""
+        """Send a 'D' message, which a server ignores."""
         self.send_raw(frame(DEBUG, text, self.bcc))
 
     def send_application(self, msgid: int = 0x80, parameters: bytes = b"\x02") -> None:
@@ -172,10 +172,10 @@ class EwsHands(Device):
 
     @on_bus_thread
     def mix_info(self, *mixes: InfoMix) -> None:
-        """Let an info record meet the next answers, one mix each."""
+        """Mix an info record into the next answers, one mix each."""
         self._mixes += mixes
 
     @on_bus_thread
     def false_length_once(self, difference: int) -> None:
-        """Let the next answer's length be wrong by so much, its BCC right."""
+        """Send the next answer with a wrong length and a correct BCC."""
         self._false_lengths.append(difference)

@@ -1,4 +1,4 @@
-"""Keys, cards and LEDs: what a person at a virtual EWS-Box does and sees."""
+"""Keys, cards and LEDs of a virtual EWS-Box."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ RED, GREEN, ORANGE, RESERVE = range(4)
 
 
 class UserInterface:
-    """What the keys mean depends on the system mode (manual, 3.1.3 and 3.1.6).
+    """Keys, cards and LEDs; keys depend on the system mode (manual, 3.1.3, 3.1.6).
 
-    `on_event(bits, keys)`: something for the info record.
+    `on_event(bits, keys)`: called with events for the info record.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class UserInterface:
             charging_port.optimised = not charging_port.optimised
 
     def key_up(self, port: int, key: int, now: float) -> None:
-        """Let it go."""
+        """Release a key."""
         since = self._down.pop((port, key), None)
         if since is None or not self._system.has(SystemMode.MANUAL_IO):
             return
@@ -78,12 +78,12 @@ class UserInterface:
         self._on_event(0, {(port - 1) * KEYS + key - 1: length})
 
     def press(self, port: int, key: int, now: float, seconds: float) -> None:
-        """Press, and let go so much later."""
+        """Press a key and release it after so many seconds."""
         self.key_down(port, key, now)
         self._releases.append((now + seconds, port, key))
 
     def step(self, now: float) -> None:
-        """Let keys go that are due."""
+        """Release the keys that are due."""
         for release in [r for r in self._releases if r[0] <= now]:
             self._releases.remove(release)
             self.key_up(release[1], release[2], release[0])
@@ -95,7 +95,7 @@ class UserInterface:
     # Starting and stopping
 
     def press_start(self, port: EwsPort) -> None:
-        """Ask for a start: of the box itself, of the server, or of a card first."""
+        """Request a start: from the box itself, the server, or with a card first."""
         if start_refusal(port) or port.active:
             return
         if not self._system.has(SystemMode.RFID):
@@ -111,7 +111,7 @@ class UserInterface:
             self._start(port, "web page")
 
     def stop_on_web_page(self, port: EwsPort) -> None:
-        """Press stop there."""
+        """Press stop on the box's web page."""
         port.stop("web page")
         self._event_of(port)
 
@@ -144,7 +144,7 @@ class UserInterface:
         self._event_of(port)
 
     def _may_stop(self, port: EwsPort) -> bool:
-        """Tell whether the card that started was held to the reader again since."""
+        """Return whether the card that started was presented again since."""
         mine, shown = port.session.card, self._reader.noted
         if mine is None:
             return True
@@ -161,7 +161,7 @@ class UserInterface:
     # Cards
 
     def present_card(self, card: Card, now: float) -> None:
-        """Hold a card to the reader."""
+        """Present a card to the reader."""
         if not self._reader.fitted:
             return
         self._reader.present_card(card, self._system.card_pin, now)
@@ -169,7 +169,7 @@ class UserInterface:
         self.card_is_valid()
 
     def card_is_valid(self) -> None:
-        """Go on with a start that waits for a card, if there is a valid one now."""
+        """Continue a start that waits for a card, if there is a valid one now."""
         if self._waits_for_card is not None and self._reader.valid:
             self._start_with_card(self._waits_for_card)
 

@@ -1,4 +1,4 @@
-"""The plug's lock and the contactor of a charging port, with all that can jam."""
+"""The plug lock and the contactor of a charging port, with their defects."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ TOGGLE_WINDOW = 30.0
 
 @dataclass(frozen=True, slots=True)
 class Unlocking:
-    """The lock went open: when (device time), why, and whether the car still wanted."""
+    """An unlocking: device time, reason, and whether the car was still requesting."""
 
     at: float
     reason: str
@@ -20,13 +20,13 @@ class Unlocking:
 
 
 class LockMotor:
-    """A bolt that needs `travel` seconds, and a switch that tells when it is out.
+    """A bolt that needs `travel` seconds, and a switch that detects it locked.
 
     `jammed`: "lock" never reaches locked, "unlock" never opens.
     """
 
     def __init__(self, travel: float = TRAVEL) -> None:
-        """Be open."""
+        """Begin open."""
         self.travel = travel
         self.jammed: Literal["", "lock", "unlock"] = ""
         self.locked = False
@@ -37,11 +37,11 @@ class LockMotor:
 
     @property
     def moving(self) -> bool:
-        """Tell whether it is on its way."""
+        """Return whether it is moving."""
         return self.target is not None
 
     def drive(self, *, locked: bool, now: float, reason: str) -> None:
-        """Start to move there; a move there already under way goes on."""
+        """Start to move; no effect if it already moves there."""
         if self.target is locked:
             return
         self.target = locked
@@ -50,12 +50,12 @@ class LockMotor:
         self._done_at = now + self.travel
 
     def step(self, now: float) -> Literal["", "locked", "unlocked", "failed"]:
-        """Return how a movement ended, once."""
+        """Return the result of a movement that has ended, once."""
         if self.target is None or now < self._done_at:
             return ""
         target, self.target = self.target, None
         if target == self.locked:
-            # Called back on its way: it never got anywhere.
+            # Reversed on its way: it never arrived.
             return "locked" if target else ""
         if self.jammed == ("lock" if target else "unlock"):
             return "failed"
@@ -70,24 +70,24 @@ class LockMotor:
 
 
 class Contactor:
-    """Switches the car's voltage; `closed` is what its feedback contact says.
+    """Switches the car's voltage; `closed` is its feedback contact.
 
     `broken`: "open" never closes, "closed" is welded once it has closed.
     """
 
     def __init__(self) -> None:
-        """Be open."""
+        """Begin open."""
         self.broken: Literal["", "open", "closed"] = ""
         self.closed = False
         self.closings: list[float] = []
         self._recent: list[float] = []
 
     def forget_toggles(self) -> None:
-        """Begin to count anew: somebody released a start."""
+        """Restart the count: a start was released."""
         self._recent.clear()
 
     def close(self, now: float) -> bool:
-        """Close; False if the feedback says otherwise."""
+        """Close; return whether the feedback confirms it."""
         if not self.closed and self.broken != "open":
             self.closed = True
             self.closings.append(now)
@@ -95,12 +95,12 @@ class Contactor:
         return self.closed
 
     def open(self) -> bool:
-        """Open; False if the feedback says otherwise."""
+        """Open; return whether the feedback confirms it."""
         if self.broken != "closed":
             self.closed = False
         return not self.closed
 
     def toggled_too_often(self, now: float) -> bool:
-        """Tell whether it closed five times in 30 s (result 9 of `rc`)."""
+        """Return whether it closed five times in 30 s (result 9 of `rc`)."""
         self._recent = [at for at in self._recent if now - at <= TOGGLE_WINDOW]
         return len(self._recent) >= TOGGLES

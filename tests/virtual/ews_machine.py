@@ -1,7 +1,7 @@
-"""What makes a charging port of a virtual EWS-Box change its status. No wire.
+"""The state machine of a charging port of a virtual EWS-Box. No wire.
 
-What each status means: manual, `rc`. What leads from one to the next is in pieces all
-over the manual (2.2, 3.1.4 to 3.1.8, 5); where it is silent, see the README.
+Statuses: manual, `rc`. Transitions: manual, 2.2, 3.1.4 to 3.1.8 and 5; the README lists
+the assumptions for the others.
 """
 
 from __future__ import annotations
@@ -57,12 +57,12 @@ class PortMachine:
 
     @property
     def contactor(self) -> bool:
-        """Tell whether the car has voltage."""
+        """Return whether the car has voltage."""
         return self.relay.closed
 
     @property
     def ceiling(self) -> int:
-        """Return min(jumper, installation, cable): the most `st` may say, A."""
+        """Return min(jumper, installation, cable): the highest limit for `st`, A."""
         installation = self.installation
         if installation.mode1:
             return MODE1_CURRENT
@@ -73,33 +73,33 @@ class PortMachine:
 
     @property
     def offered(self) -> int:
-        """Return what the box delivers at most now, A."""
+        """Return the highest current the box delivers now, A."""
         return min(self.ceiling, self.limit or self.ceiling)
 
     @property
     def pilot(self) -> bool:
-        """Tell whether a car is seen on the pilot."""
+        """Return whether a car is detected on the pilot."""
         return self.car is not None and self.car.plugged and self.cable_in
 
     @property
     def active(self) -> bool:
-        """Tell whether a charge is going on, pauses of the car included."""
+        """Return whether a charge is going on, pauses of the car included."""
         return self.status in Status.ACTIVE and not self.server_paused
 
     @property
     def in_use(self) -> bool:
-        """Tell whether it blocks the other one in exclusive mode."""
+        """Return whether it blocks the other port in exclusive mode."""
         return self.status not in {0x00, 0x10, Status.BLOCKED, Status.INIT}
 
     @property
     def has_lock(self) -> bool:
-        """Tell whether a lock is used at all."""
+        """Return whether it has a lock."""
         return not (self.installation.fixed_cable or self.installation.mode1)
 
     # Starting and unlocking
 
     def pull_cable(self) -> bool:
-        """Pull the cable at the box; False if the lock holds it."""
+        """Pull the cable at the box; return False if it is locked."""
         if self.lock.locked or self.lock.moving:
             return False
         self.cable_in = self._loose_cable = False
@@ -119,7 +119,7 @@ class PortMachine:
         """Open the lock, unless the contactor is closed."""
         self.server_paused = False
         if self.status in Status.ACTIVE and not self.contactor:
-            # Shown as a pause so far, if so configured; the charge is over now.
+            # Until now it may have been shown as a pause; now the charge is over.
             self._go(Status.ENDED)
         engaged = self.lock.locked or self.lock.target
         if self.has_lock and engaged and not self.contactor:
@@ -130,7 +130,7 @@ class PortMachine:
     _cause = ""
 
     def step(self, now: float) -> None:
-        """Live until now."""
+        """Advance to this time."""
         self._now = now
         ended = self.lock.step(now)
         self._cable_moves()
@@ -149,7 +149,7 @@ class PortMachine:
         if self.installation.fixed_cable or comes:
             self.cable_in = True
         elif self.cable_in and not plugged and not self._loose_cable:
-            # The driver has pulled at the car and waits for the lock.
+            # The driver has unplugged the car and waits for the lock.
             self.pull_cable()
         if not self.pilot:
             self._seen_since = None
@@ -205,7 +205,7 @@ class PortMachine:
         elif self.installation.fixed_cable and not self.pilot:
             self._gone(Status.SEARCHING)
         elif self.server_paused and not self._starting and not self.pilot:
-            # Nothing to hold any longer: the driver wants his cable.
+            # The car has left: the driver takes the cable.
             self._end(Status.ENDED, Result.PILOT_LOST, "pilot lost")
 
     def _initialising(self) -> None:
@@ -251,7 +251,7 @@ class PortMachine:
             self._begin()
 
     def _idle_status(self) -> int:
-        """Return the first of these that holds."""
+        """Return the first status whose condition holds."""
         installation = self.installation
         since = self._now if self._seen_since is None else self._seen_since
         seen = self._seen_since is not None and self._now - since >= self.search_time
@@ -350,7 +350,7 @@ class PortMachine:
             self.session.result = result
 
     def _gone(self, status: int) -> None:
-        """Forget this car."""
+        """Drop all state of the car that left."""
         self.start_mode = 0
         self.server_paused = self._starting = self.optimised = False
         self.session.gone()

@@ -1,4 +1,4 @@
-"""What `sl` does, and its answer codes; the codes are the manual's."""
+"""The orders of `sl`, and their answer codes (manual)."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ REFUSES_START = {
 
 
 def start_refusal(port: EwsPort) -> int:
-    """Return why a start is not possible now, or 0."""
+    """Return the code for a start that is not possible now, or 0."""
     if port.server_paused:
         return Code.OK
     return REFUSES_START.get(port.status, Code.OK)
 
 
 def obey(port: EwsPort, order: int, press_start: Callable[[EwsPort], None]) -> int:
-    """Do one order of `sl` and return the answer code."""
+    """Execute one order of `sl` and return the answer code."""
     if not STOP <= order <= LOCK:
         return Code.NO_SUCH_ORDER
     if not port.installation.enabled:

@@ -44,7 +44,7 @@ class CableMode:
 
 
 def masked(password: bytes, masking: Masking) -> bytes:
-    """Return what a box that hides its passwords tells of one."""
+    """Return a password as the box sends it."""
     if masking == "no":
         return password
     return (b"\x00" if masking == "zeros" else b"*") * len(password)
@@ -81,7 +81,7 @@ class SystemParameters:
         mode1: tuple[bool, bool],
         **others: int,
     ) -> SystemParameters:
-        """Make parameters from what their bits mean; the server's is RS-232's."""
+        """Make parameters from their flags; the server is on RS-232."""
         return cls(
             mode=SystemMode.RS232
             | SystemMode.SERVER * server
@@ -110,7 +110,7 @@ class SystemParameters:
         )
 
     def write(self, block: bytes, *, network: bool) -> int:
-        """Take a block; over the network the server mode stays as it is."""
+        """Store a block; over the network the server mode stays as it is."""
         if len(block) != SP.size:
             return REFUSED
         new = SystemParameters(*SP.unpack(block))
@@ -131,7 +131,7 @@ class SystemParameters:
         return OK
 
     def has(self, bit: int) -> bool:
-        """Tell whether a bit of the system mode is set."""
+        """Return whether a bit of the system mode is set."""
         return bool(self.mode & bit)
 
 
@@ -156,7 +156,7 @@ class UserParameters:
         return SU.pack(*values)
 
     def write(self, block: bytes) -> int:
-        """Take a block."""
+        """Store a block."""
         if len(block) != SU.size:
             return REFUSED
         new = UserParameters(*SU.unpack(block))
@@ -181,7 +181,7 @@ class UserInfo:
         return SI.pack(*vars(self).values())
 
     def write(self, block: bytes) -> int:
-        """Take a block."""
+        """Store a block."""
         if len(block) != SI.size:
             return REFUSED
         vars(self).update(vars(UserInfo(*SI.unpack(block))))
@@ -205,7 +205,7 @@ class ExtraConfiguration:
         return SZ.pack(*vars(self).values())
 
     def write(self, block: bytes) -> int:
-        """Take a block."""
+        """Store a block."""
         if len(block) != SZ.size:
             return REFUSED
         new = ExtraConfiguration(*SZ.unpack(block))
@@ -223,8 +223,8 @@ class ExtraConfiguration:
 class CardList:
     """`rf` and `sf`: 64 entries of kind (4 bits), group and card (14 bits each).
 
-    `kinds`: what 1 and 2 mean, since the manual says both: "sf" (1 group, 2 single) or
-    "3.1.6" (1 single, 2 group); 3 = blocked.
+    `kinds`: the meaning of 1 and 2, for which the manual has both: "sf" (1 group, 2
+    single) and "3.1.6" (1 single, 2 group); 3 = blocked.
     """
 
     entries: list[int] = field(default_factory=lambda: [0] * CARD_ENTRIES)
@@ -235,7 +235,7 @@ class CardList:
         return struct.pack(f">{CARD_ENTRIES}I", *self.entries)
 
     def write(self, block: bytes) -> int:
-        """Take a block."""
+        """Store a block."""
         if len(block) != CARD_ENTRIES * 4:
             return REFUSED
         entries = list(struct.unpack(f">{CARD_ENTRIES}I", block))
@@ -250,7 +250,7 @@ class CardList:
         self.entries[self.entries.index(0)] = value
 
     def allows(self, group: int, card: int) -> bool:
-        """Tell whether a card is on the list and not blocked."""
+        """Return whether a card is on the list and not blocked."""
         of_group, single = (1, 2) if self.kinds == "sf" else (2, 1)
         allowed = False
         for entry in self.entries:

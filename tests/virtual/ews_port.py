@@ -1,4 +1,4 @@
-"""One charging port of a virtual EWS-Box: what is done to it, and what is seen."""
+"""One charging port of a virtual EWS-Box: its orders and events."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ if TYPE_CHECKING:
 class EwsPort(PortMachine):
     """A port; plain attributes may be set at any time.
 
-    - `cable`: A of the plugged cable (None: not readable); `cable_must_match`: a lesser
-      one than the installation's is an error, not a limit
-    - `limit`: `st`'s; `optimised`, `start_mode` (0, 1 asked of the server, 2 released)
-    - `rcd_tripped`, `meter_broken`, `wants_fan`: faults and wishes
-    - `pause_status`: what a stop by `sl` 6 shows, 0x50 or 0x42
+    - `cable`: A of the plugged cable (None: not readable); `cable_must_match`: one below
+      the installation's current is an error, not a limit
+    - `limit`: of `st`; `optimised`; `start_mode`: 0, 1 requested, 2 released
+    - `rcd_tripped`, `meter_broken`; `wants_fan`: the car requires ventilation
+    - `pause_status`: the status after a stop by `sl` 6, 0x50 or 0x42
     """
 
-    # What a test looks at
+    # For tests
 
     @property
     def locked(self) -> bool:
-        """Tell whether the plug is locked in."""
+        """Return whether the plug is locked."""
         return self.lock.locked
 
     @property
     def unlocked_while_car_wants(self) -> list[Unlocking]:
-        """Return the unlockings under a car that was asking for charge."""
+        """Return the unlockings while the car was requesting charge."""
         return [u for u in self.witness.unlockings if u.car_wanted]
 
     @property
@@ -39,18 +39,18 @@ class EwsPort(PortMachine):
         """Return the car's phase currents, A."""
         return self.car.phase_currents if self.car else (0.0, 0.0, 0.0)
 
-    # What happens to it
+    # Events
 
     def plug_cable(self) -> None:
-        """Plug a cable in that has no car at its other end."""
+        """Plug in a cable without a car at its other end."""
         self.cable_in = self._loose_cable = True
 
     def tear_cable_out(self) -> None:
-        """Pull it by force."""
+        """Pull it by force, also out of a lock."""
         self.cable_in = self._loose_cable = False
 
     def initialise(self, now: float, duration: float) -> None:
-        """Go to 0xF0 for so long."""
+        """Go to 0xF0 for this time (s)."""
         self._now = now
         self._go(Status.INIT)
         self._init_until = now + duration
@@ -59,9 +59,9 @@ class EwsPort(PortMachine):
         self.relay.open()
 
     def power_off(self, now: float, *, restart: bool, mains: bool = True) -> None:
-        """Lose the mains: contactor open, lock open, `st` forgotten.
+        """Lose the mains: contactor open, lock open, the limit of `st` lost.
 
-        Or only the processor (`mains` False): the lock stays where it is.
+        Without `mains` only the processor restarts: the lock stays where it is.
         """
         self._now = now
         self._restart = restart and self.active

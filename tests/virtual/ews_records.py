@@ -1,4 +1,4 @@
-"""What a virtual EWS-Box keeps for the tests, and how its answers go wrong."""
+"""Records that a virtual EWS-Box keeps for the tests, and defects of its answers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .ews_frames import ANSWER, Bcc, frame
 
 @dataclass(frozen=True, slots=True)
 class EwsCommand:
-    """A command that was heard: real and device time, what, and the answer's data.
+    """A command received: real and device time, contents, and data of the answer.
 
     `answer` None: none was sent (unknown command).
     """
@@ -24,7 +24,7 @@ class EwsCommand:
 
 @dataclass(frozen=True, slots=True)
 class EwsLimit:
-    """An `st` that was heard: real time, port, amperes."""
+    """An `st` received: real time, port, amperes."""
 
     t: float
     port: int
@@ -34,7 +34,7 @@ class EwsLimit:
 
 @dataclass(frozen=True, slots=True)
 class EwsInfo:
-    """An info record that was sent: real time, change bits, eight key bytes."""
+    """An info record sent: real time, change bits, eight key bytes."""
 
     t: float
     bits: int
@@ -43,11 +43,11 @@ class EwsInfo:
 
 @dataclass(frozen=True, slots=True)
 class InfoMix:
-    """How an info record meets an answer.
+    """An info record in the same bytes as an answer.
 
-    `where`: "before" or "after" the answer in the same lump, or "inside", at byte `at`
-    of it: a real box would not, and that answer is broken. `cut`: the lump ends after
-    so many bytes, the rest comes `pause` seconds later.
+    `where`: "before" or "after" the answer, or "inside", at byte `at` of it: no real box
+    does that, and the answer is damaged. `cut`: number of bytes after which there is a
+    pause of `pause` seconds.
     """
 
     where: Literal["before", "after", "inside", "none"] = "before"
@@ -58,7 +58,7 @@ class InfoMix:
 
 
 def with_false_length(parameters: bytes, difference: int, bcc: Bcc) -> bytes:
-    """Return an answer whose length is wrong by so much, its BCC right all the same."""
+    """Return an answer with a length wrong by `difference` and a correct BCC."""
     data = bytearray(frame(ANSWER, parameters, bcc))
     claimed = (len(parameters) + difference & 0xFFFF).to_bytes(2, "big")
     data[-1] ^= data[1] ^ data[2] ^ claimed[0] ^ claimed[1]
@@ -67,7 +67,7 @@ def with_false_length(parameters: bytes, difference: int, bcc: Bcc) -> bytes:
 
 
 def mixed(answer: bytes, record: bytes, mix: InfoMix) -> tuple[bytes, bytes]:
-    """Return the lump with the answer and the record, and what comes later."""
+    """Return answer and record in two parts: before and after the pause."""
     if mix.where == "none":
         record = b""
     at = {"before": 0, "after": len(answer)}.get(mix.where, mix.at)

@@ -1,4 +1,4 @@
-"""The RFID reader of a virtual EWS-Box and the cards held to it."""
+"""The RFID reader of a virtual EWS-Box, and its cards."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FIRMWARE_LENGTH = 11
 
 @dataclass(frozen=True)
 class Card:
-    """A card: what it says, and whether the box can decode it.
+    """A card: its data, and whether the box can decode it.
 
     `pin` None: formatted for this box; `foreign`: another format.
     """
@@ -28,7 +28,7 @@ class Card:
     foreign: bool = False
 
     def user(self) -> bytes:
-        """Return group, card and name as `rc`, `rd` and `rs` tell them: 12 bytes."""
+        """Return group, card and name as in `rc`, `rd` and `rs`: 12 bytes."""
         name = self.name.encode("latin-1").ljust(NAME_LENGTH, b"\x00")[:NAME_LENGTH]
         return struct.pack(">HH8s", self.group, self.number, name)
 
@@ -42,7 +42,7 @@ class Reader:
     """The card reader; `fitted` False: 0xA7 and a reader error."""
 
     def __init__(self) -> None:
-        """Have no card before it."""
+        """Begin without a card."""
         self.fitted = True
         self.firmware = b"MCR6241-100"
         self.present: Card | None = None
@@ -52,7 +52,7 @@ class Reader:
         self.presented_at = float("-inf")
 
     def present_card(self, card: Card, pin: bytes, now: float) -> None:
-        """Hold a card to it; it is noted until another one comes."""
+        """Present a card; its data are kept until another one comes."""
         self.present = self.noted = card
         self.presented_at = now
         self.accepted = False
@@ -60,16 +60,16 @@ class Reader:
         self.decode_error = 1 if card.foreign else 2 if wrong_pin else 0
 
     def remove_card(self) -> None:
-        """Take the card away; it stays noted."""
+        """Remove the card; its data are kept."""
         self.present = None
 
     @property
     def valid(self) -> bool:
-        """Tell whether the noted card was decoded, or accepted by the server."""
+        """Return whether the last card was decoded, or accepted by the server."""
         return self.noted is not None and (self.accepted or not self.decode_error)
 
     def accept(self, parameters: bytes, now: float) -> int:
-        """Take `ma`: group, card, name, and perhaps the tag's number."""
+        """Accept a card by `ma`: group, card, name, and perhaps the tag number."""
         if len(parameters) not in (12, 12 + TAG_LENGTH):
             return REFUSED
         group, number, name = struct.unpack(">HH8s", parameters[:12])
@@ -80,7 +80,7 @@ class Reader:
         return OK
 
     def transparent(self, parameters: bytes) -> bytes:
-        """Answer `mc`: RC and data; it knows the firmware id and the tag's number."""
+        """Return the answer to `mc`: RC and data, the firmware id or the tag number."""
         if len(parameters) < 2 or parameters[0] not in (TO_READER, TO_CARD):
             return bytes((REFUSED,))
         data = parameters[2:]
@@ -97,7 +97,7 @@ class Reader:
     def status(self, *, valid: bool) -> bytes:
         """Return the last 34 bytes of `rs`: the reader and the card.
 
-        Without a card before it the rest is what it last was: "ungueltig".
+        Without a card at the reader the rest keeps its last value: "ungueltig".
         """
         found = self.present is not None
         known = self.noted is not None

@@ -1,4 +1,4 @@
-"""The meter and the times of one charge, and of the last one."""
+"""Meter and times of the current charge, and of the last one."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ class Result:
 
 
 class Session:
-    """Counts seconds and Wh; `card` is who is logged in.
+    """Counts seconds and Wh; `card` is the one that is logged in.
 
     `total_wh` is the absolute meter, `cycles` the number of charges so far.
     """
 
     def __init__(self) -> None:
-        """Have charged nothing yet."""
+        """Begin at zero."""
         self.seconds = self.wh = 0.0
         self.last_seconds = self.last_wh = 0.0
         self.total_wh = 0.0
@@ -34,7 +34,7 @@ class Session:
         self._at: float | None = None
 
     def start(self, *, resumed: bool) -> None:
-        """Begin at zero, or go on after a pause of the server's."""
+        """Begin at zero, or continue after a pause by the server."""
         self.result = Result.NONE
         if not resumed:
             self.seconds = self.wh = 0.0
@@ -48,7 +48,7 @@ class Session:
         self.last_end = at
 
     def gone(self) -> None:
-        """Forget the car that left."""
+        """Drop the state of the car that left."""
         self.seconds = self.wh = 0.0
         self.card = None
 

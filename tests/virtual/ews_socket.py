@@ -1,4 +1,4 @@
-"""The calling end of a TCP connection, with the habits of a small LAN chip."""
+"""The client end of a TCP connection, as a small LAN chip implements it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RESET = struct.pack("ii", 1, 0)
 
 
 class DialPort:
-    """Dials an address until somebody answers; all calls are on the bus thread.
+    """Dials an address until it is connected; all calls are on the bus thread.
 
     `ghosts`: sockets of connections that were left half-open.
     """
@@ -35,7 +35,7 @@ class DialPort:
         on_change: Callable[[bool], None],
         retry: float,
     ) -> None:
-        """Know the number; `plug` begins to dial."""
+        """Prepare; `plug` begins to dial."""
         self._loop = loop
         self._on_bytes = on_bytes
         self._address = address
@@ -57,12 +57,12 @@ class DialPort:
 
     @property
     def url(self) -> str:
-        """Return whom it dials."""
+        """Return the address it dials."""
         return f"dial://{self._address[0]}:{self._address[1]}"
 
     @property
     def connected(self) -> bool:
-        """Tell whether somebody answered."""
+        """Return whether it is connected."""
         return self._connected
 
     def plug(self) -> None:
@@ -90,7 +90,7 @@ class DialPort:
         self.bury_ghosts()
 
     def hang_up(self, *, silent: bool = False, redial: bool = True) -> None:
-        """End the connection; `silent`: without telling the other end."""
+        """End the connection; `silent`: leave it half-open."""
         for timer in (self._timer, self._send_timer):
             if timer is not None:
                 timer.cancel()
@@ -110,7 +110,7 @@ class DialPort:
             self.dial_later()
 
     def bury_ghosts(self) -> None:
-        """Reset what was left half-open."""
+        """Reset the connections that were left half-open."""
         for ghost in self.ghosts:
             ghost.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
             ghost.close()

@@ -1,4 +1,4 @@
-"""The words of a charging port: status bytes, its installation, its witness."""
+"""Status bytes, installation and history of a charging port."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Status:
 
 @dataclass
 class Installation:
-    """What the parameters say about a port; the box keeps it up to date."""
+    """The parameters of a port; kept up to date by the box."""
 
     enabled: bool = True
     jumper: int = 32
@@ -42,7 +42,7 @@ class Installation:
 
 @dataclass
 class Witness:
-    """What a test wants to know of a port's past; times are device times."""
+    """History of a port for tests, in device time."""
 
     statuses: list[tuple[float, int]] = field(default_factory=list)
     starts: list[tuple[float, str]] = field(default_factory=list)

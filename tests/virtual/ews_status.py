@@ -26,7 +26,7 @@ PROXIMITY = {None: 4.46, 13: 3.73, 20: 3.11, 32: 1.9, 63: 1.13, 70: 1.13}
 
 
 def pwm_percent(port: EwsPort) -> int:
-    """Return the duty cycle put out, % (100 = none)."""
+    """Return the duty cycle of the pilot, % (100 = none)."""
     if not port.active or port.installation.mode1:
         return NO_PWM
     amps = port.offered
@@ -34,7 +34,7 @@ def pwm_percent(port: EwsPort) -> int:
 
 
 def pilot_volts(port: EwsPort) -> tuple[float, float]:
-    """Return the lowest and the highest voltage on the pilot."""
+    """Return the lowest and the highest voltage on the pilot, V."""
     if port.installation.mode1:
         return 0.0, 0.0
     if not port.pilot:
@@ -92,7 +92,7 @@ def _port_status(box: EwsBox, port: EwsPort) -> bytes:
 
 
 def rd(box: EwsBox) -> bytes:
-    """Return what is not in `rc`: 56 bytes, and what later versions add."""
+    """Return the details of both ports: 56 bytes, and those that later versions add."""
     one, two = box.ports
     return (
         RD.pack(
@@ -134,7 +134,7 @@ def clock_fields(now: datetime) -> tuple[int, ...]:
 
 
 def rs(box: EwsBox) -> bytes:
-    """Return the system's status: 105 bytes."""
+    """Return the status of the system: 105 bytes."""
     one, two = box.ports
     status = (
         box.restarted
@@ -162,7 +162,7 @@ def rs(box: EwsBox) -> bytes:
 
 
 def rg(box: EwsBox) -> bytes:
-    """Return what DHCP gave: 28 bytes, zeros without it."""
+    """Return the addresses from DHCP: 28 bytes, zeros without it."""
     if box.user.own_ip != bytes(4):
         return bytes(RG.size)
     used = int(box.now() % box.lease) if box.lease else 0

@@ -1,4 +1,4 @@
-"""What can go wrong on a wire, by rates or just once."""
+"""Faults of a wire, by rate or once."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class Faults:
     """Faults of one device, or of the whole bus (`bus.faults`).
 
     Rates are probabilities per reply, `byte_error_rate` per byte. All can be set at
-    any time from any thread. `echo` and `noise_rate` (bytes per second) have a meaning
-    only on the bus; `dead` on the bus is a cut cable: nothing reaches any device.
+    any time from any thread. `echo` and `noise_rate` (bytes per second) count on the
+    bus only; `dead` on the bus is a cut cable: no byte reaches any device.
     """
 
     byte_error_rate: float = 0.0
@@ -34,7 +34,7 @@ class Faults:
     _once: deque[tuple[Kind, object]] = field(default_factory=deque)
 
     def once(self, kind: Kind, value: float | bytes | None = None) -> None:
-        """Let the next reply suffer; several calls are for several replies in turn.
+        """Apply a fault to the next reply; several calls: several replies in turn.
 
         - `lose`: it is never sent
         - `late`: sent `value` seconds later (default `late_by`)
@@ -47,7 +47,7 @@ class Faults:
         self._once.append((kind, value))
 
     def clear(self) -> None:
-        """Take all faults away, also those waiting; the counters stay."""
+        """Remove all faults, pending ones included; the counters stay."""
         self.byte_error_rate = self.lose_rate = self.late_rate = 0.0
         self.duplicate_rate = self.truncate_rate = self.noise_rate = 0.0
         self.dead = self.echo = False
@@ -56,7 +56,7 @@ class Faults:
     def apply(
         self, replies: list[tuple[float, bytes]], rng: Random
     ) -> list[tuple[float, bytes]]:
-        """Return what becomes of the replies: (delay in seconds, bytes) pairs."""
+        """Return the replies with faults applied, as pairs of delay (s) and bytes."""
         if self.dead:
             self._count("dead")
             return []

@@ -1,4 +1,4 @@
-"""The traffic log: what was on the wire, when, and from whom. The witness."""
+"""The traffic log: every transmission on the wire, with its times and sender."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ NOISE = "noise"
 class Entry:
     """One transmission.
 
-    `data` is what the sender sent, `wire` what the others could hear: they differ if
-    it collided or was disturbed. Times are real monotonic seconds.
+    `data`: bytes as sent; `wire`: bytes as received, different after a collision or a
+    fault. Times are real monotonic seconds.
     """
 
     t: float
@@ -52,7 +52,7 @@ class TrafficLog:
         self.total += 1
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Remove all entries."""
         self._entries.clear()
 
     @property
@@ -70,7 +70,7 @@ class TrafficLog:
         return iter(self.entries)
 
     def __len__(self) -> int:
-        """Return how many entries are kept."""
+        """Return the number of entries kept."""
         return len(self._entries)
 
     def of(self, source: str, since: float = 0.0) -> list[Entry]:
@@ -82,9 +82,9 @@ class TrafficLog:
         return b"".join(e.data for e in self.of(CLIENT, since))
 
     def bursts(self, source: str = CLIENT, gap: float = 0.003) -> list[Entry]:
-        """Return transmissions of one source, those without a pause between joined.
+        """Return transmissions of one source; those without a pause between are joined.
 
-        A frame that the client wrote in several pieces comes back in one piece.
+        A frame that the client wrote in several pieces is one entry.
         """
         result: list[Entry] = []
         for entry in self.of(source):

@@ -1,7 +1,7 @@
 """The bus thread: an event loop of its own, exact to some tens of microseconds.
 
-A test may block, or fake the time of Home Assistant's loop: the virtual bus must not
-notice. So it runs in its own thread, on a clock that nobody patches.
+A test may block, or fake the time of Home Assistant's loop, without effect on the
+virtual bus. So it runs in its own thread, on a clock that is never patched.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class BorrowedLoop:
 
 
 class _Waiter:
-    """Somebody waiting until a condition holds."""
+    """A caller that waits until a condition holds."""
 
     def __init__(self, predicate: Callable[[], object]) -> None:
         """Remember the condition."""
@@ -116,7 +116,7 @@ class LoopThread:
 
     @property
     def running(self) -> bool:
-        """Tell whether the thread runs."""
+        """Return whether the thread runs."""
         return self._loop is not None
 
     def start_thread(self) -> None:
@@ -158,7 +158,7 @@ class LoopThread:
         else:
             with contextlib.suppress(RuntimeError):
                 loop.call_soon_threadsafe(loop.stop)
-            # Until it has really ended, what is due there may still need the loop.
+            # Until it has ended, callbacks that are due may still need the loop.
             thread.join(CALL_TIMEOUT)
         self._loop = None
         self._thread = None
@@ -168,7 +168,7 @@ class LoopThread:
         self._waiters.clear()
 
     def call(self, function: Callable[[], T]) -> T:
-        """Run a function on the bus thread and return what it returns."""
+        """Run a function on the bus thread and return its result."""
         if self._loop is None or threading.current_thread() is self._thread:
             return function()
         return self._submit(function).result(CALL_TIMEOUT)
@@ -182,8 +182,8 @@ class LoopThread:
     def wait_for(self, predicate: Callable[[], T], timeout: float = 5.0) -> T:
         """Block until the predicate is true; return its value.
 
-        It is asked on the bus thread after everything that happens there, and at every
-        tick. The time-out is real time, counted by the bus.
+        It is evaluated on the bus thread after everything that happens there, and at
+        every tick. The time-out is real time, counted by the bus.
         """
         return self._wait(predicate, timeout).result()  # type: ignore[return-value]
 
@@ -197,11 +197,11 @@ class LoopThread:
         return await asyncio.wrap_future(future)  # type: ignore[arg-type]
 
     def check_waiters(self) -> None:
-        """Ask the predicates again (on the bus thread)."""
+        """Evaluate the predicates again (on the bus thread)."""
         for waiter in tuple(self._waiters):
             try:
                 value = waiter.predicate()
-            except Exception as error:  # noqa: BLE001 - belongs to who waits
+            except Exception as error:  # noqa: BLE001 - raised to the waiting caller
                 self._finish(waiter, None, error)
             else:
                 if value:
@@ -211,12 +211,12 @@ class LoopThread:
         future: concurrent.futures.Future[T] = concurrent.futures.Future()
 
         def run() -> None:
-            # A caller that was cancelled meanwhile no longer wants it done.
+            # The caller may have been cancelled meanwhile.
             if not future.set_running_or_notify_cancel():
                 return
             try:
                 value = function()
-            except BaseException as error:  # noqa: BLE001 - belongs to the caller
+            except BaseException as error:  # noqa: BLE001 - raised to the caller
                 future.set_exception(error)
             else:
                 future.set_result(value)
@@ -266,7 +266,7 @@ class LoopThread:
     def _on_error(
         self, loop: asyncio.AbstractEventLoop, context: dict[str, object]
     ) -> None:
-        """Keep an error of the virtual chargers themselves: `stop` raises it."""
+        """Keep an error in the virtual chargers: `stop` raises it."""
         error = context.get("exception")
         if isinstance(error, BaseException):
             self.errors.append(error)

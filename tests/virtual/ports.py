@@ -19,39 +19,39 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 READ_SIZE = 4096
-# With a client; and without one, so that its first bytes need not wait long.
+# With a client, and without one: shorter, so that its first bytes are read soon.
 CHORE_INTERVAL = 0.02
 AWAIT_INTERVAL = 0.005
 
 
 class Port(Protocol):
-    """What the bus needs of the client's end. All calls are on the bus thread."""
+    """The client's end, as the bus uses it. All calls are on the bus thread."""
 
     overruns: int
     opened: int
 
     @property
     def url(self) -> str:
-        """Return what a client opens."""
+        """Return the path or URL that a client opens."""
 
     @property
     def connected(self) -> bool:
-        """Tell whether a client has it open."""
+        """Return whether a client has it open."""
 
     def plug(self) -> None:
         """Make the port appear."""
 
     def unplug(self) -> None:
-        """Make the port vanish, as a pulled adapter does."""
+        """Make the port disappear, as a pulled adapter does."""
 
     def write(self, data: bytes) -> None:
-        """Give bytes to the client; lost if there is none."""
+        """Send bytes to the client; they are lost if there is none."""
 
     def after_reply(self) -> None:
-        """Do what must be done after each reply."""
+        """Prepare the port for the next open; called after each reply."""
 
     def close(self) -> None:
-        """Vanish for good."""
+        """Remove the port for good."""
 
 
 class PtyPort:
@@ -82,7 +82,7 @@ class PtyPort:
 
     @property
     def connected(self) -> bool:
-        """Tell whether a client has the terminal open."""
+        """Return whether a client has the terminal open."""
         return self._reading
 
     def plug(self) -> None:
@@ -92,8 +92,8 @@ class PtyPort:
         master, slave = os.openpty()
         _make_raw(slave)
         self._slave_path = os.ttyname(slave)
-        # From now on a terminal without a client reports a hang-up: so that opening
-        # and closing can be seen.
+        # From now on a terminal without a client reports a hang-up, which shows when
+        # it is opened and closed.
         os.close(slave)
         os.set_blocking(master, False)
         self._master = master
@@ -103,7 +103,7 @@ class PtyPort:
         self._chore()
 
     def unplug(self) -> None:
-        """Take the terminal and the link away: the client gets a hang-up."""
+        """Remove the terminal and the link: the client gets a hang-up."""
         if self._master < 0:
             return
         if self._timer is not None:
@@ -116,7 +116,7 @@ class PtyPort:
         self._master = -1
 
     def write(self, data: bytes) -> None:
-        """Give bytes to the client."""
+        """Send bytes to the client."""
         if not self._reading:
             return
         try:
@@ -134,14 +134,14 @@ class PtyPort:
         self._forget_speed()
 
     def close(self) -> None:
-        """Take everything away."""
+        """Remove the port and its files."""
         self.unplug()
         if self._own_folder is not None:
             shutil.rmtree(self._own_folder, ignore_errors=True)
 
     def _chore(self) -> None:
-        """See whether a client came, and keep the next open possible."""
-        # A client may also have come, written and gone since we last looked.
+        """Detect a client, and keep the next open possible."""
+        # A client may also have opened, written and closed since the last time.
         if not self._reading and self._somebody_was_here():
             self._reading = True
             self.opened += 1
@@ -151,7 +151,7 @@ class PtyPort:
         self._timer = self._loop.call_later(interval, self._chore)
 
     def _forget_speed(self) -> None:
-        """Set the terminal's speed to one that no client asks for.
+        """Set the terminal's speed to one that no client sets.
 
         The driver drops the parity flag, and the C library refuses an open (EINVAL) in
         which nothing but the dropped flag would change. With another speed before it,
@@ -185,10 +185,10 @@ class PtyPort:
             self._on_bytes(data)
 
     def _hung_up(self) -> None:
-        """Note that the client has closed; what it did not read is gone."""
+        """Drop bytes that the client has not read before it closed."""
         self._stop_reading()
         self._forget_speed()
-        # Only the slave's end can throw away what waits to be read there.
+        # Only the slave's end can drop bytes that wait to be read there.
         with contextlib.suppress(OSError, termios.error):
             slave = os.open(self._slave_path, os.O_RDWR | os.O_NOCTTY)
             try:
@@ -326,7 +326,7 @@ class TcpPort:
 
     @property
     def connected(self) -> bool:
-        """Tell whether a client is connected."""
+        """Return whether a client is connected."""
         return self._client is not None
 
     def plug(self) -> None:
@@ -351,7 +351,7 @@ class TcpPort:
             self._server = None
 
     def write(self, data: bytes) -> None:
-        """Give bytes to the client."""
+        """Send bytes to the client."""
         if self._client is None:
             return
         try:
@@ -364,10 +364,10 @@ class TcpPort:
         self.overruns += len(data) - written
 
     def after_reply(self) -> None:
-        """Do nothing: a socket has no traps."""
+        """Do nothing: a socket needs no preparation."""
 
     def close(self) -> None:
-        """Take everything away."""
+        """Remove the port and its files."""
         self.unplug()
 
     def _accept(self) -> None:
@@ -389,7 +389,7 @@ class TcpPort:
         self._loop.add_reader(client.fileno(), self._readable)
 
     def _client_gone(self) -> bool:
-        """Tell whether the client closed and we have not noticed yet."""
+        """Return whether the client has closed, noticed here or not."""
         if self._client is None:
             return True
         try:

@@ -1,4 +1,4 @@
-"""A client of bare system calls: what the virtual chargers are tested with."""
+"""A client of bare system calls, for the tests of the virtual chargers."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class RawClient:
         self.close()
 
     def close(self) -> None:
-        """Close; twice is no harm."""
+        """Close; no effect if already closed."""
         if self._socket is not None:
             self._socket.close()
         elif self.fd >= 0:
@@ -58,7 +58,7 @@ class RawClient:
             raise OSError("a short write")
 
     def read(self, count: int, timeout: float = 2.0) -> bytes:
-        """Read `count` bytes, or what came until the time-out or the hang-up."""
+        """Read `count` bytes, or fewer up to the time-out or the hang-up."""
         data = b""
         end = time.monotonic() + timeout
         while len(data) < count:
@@ -73,7 +73,7 @@ class RawClient:
         return data
 
     def read_line(self, end: bytes = b"\n", timeout: float = 2.0) -> bytes:
-        """Read until that byte, or what came until the time-out."""
+        """Read up to that byte, or up to the time-out."""
         data = b""
         limit = time.monotonic() + timeout
         while not data.endswith(end):
@@ -84,7 +84,7 @@ class RawClient:
         return data
 
     def ask(self, data: bytes, end: bytes = b"\n", timeout: float = 2.0) -> bytes:
-        """Write, and read until that byte."""
+        """Write, and read up to that byte."""
         self.write(data)
         return self.read_line(end, timeout)
 

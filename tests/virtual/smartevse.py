@@ -18,19 +18,20 @@ if TYPE_CHECKING:
     from .smartevse_outlet import SmartEvseOutlet
     from .wire import Segment
 
-# Later than the answer's silence, or it would never be the turn-round that counts.
+# Beyond the silence before a reply, so that the turn-round time counts.
 EPSILON = 0.0001
-# How differently boxes notice a silence.
+# Spread of the boxes' detection of a silence, s.
 SPREAD = 0.004
 
 
 class SmartEvse(Device):
-    """A SmartEVSE; `controller` is what it makes of frames, `outlet` its inside.
+    """A SmartEVSE; `controller` handles its frames, `outlet` has its states.
 
-    - `dialect`: "2.17", "2.20" or "later"; `load_balance`: 0 off, 1 master, else slave
-      and unit; `unit`: its address with load balancing off, if not the dialect's
+    - `dialect`: "2.17", "2.20" or "later"; `load_balance`: 0 off, 1 master, else a
+      slave and its unit; `unit`: its address with load balancing off, if not the
+      default of the dialect
     - `config`: "socket" (with a `cable` of 13, 16, 32 or 63 A) or "fixed"
-    - `override_works`: False = a 2.17 before the override: refused, no effect
+    - `override_works`: False: a 2.17 before the override: refused, no effect
     - `settings`: further stored settings by name, see `smartevse_registers`
     """
 
@@ -83,21 +84,21 @@ class SmartEvse(Device):
         self._heard_until = float("-inf")
         self._frame_timer: asyncio.TimerHandle | None = None
 
-    # What a test looks at
+    # For tests: state
 
     @property
     def outlet(self) -> SmartEvseOutlet:
-        """Return the inside."""
+        """Return its outlet."""
         return self.controller.outlet
 
     @property
     def car(self) -> Car | None:
-        """Return the car it charges, or would."""
+        """Return its car, plugged in or not."""
         return self.outlet.car
 
     @property
     def unit(self) -> int:
-        """Return the address it has now."""
+        """Return its address now."""
         return self.controller.unit
 
     @property
@@ -107,7 +108,7 @@ class SmartEvse(Device):
 
     @property
     def serial(self) -> int:
-        """Return the serial number; only the later dialect tells it."""
+        """Return the serial number; only the later dialect reports it."""
         return self.controller.serial
 
     @serial.setter
@@ -116,7 +117,7 @@ class SmartEvse(Device):
 
     @property
     def access(self) -> bool:
-        """Tell whether it may charge."""
+        """Return whether it may charge."""
         return self.outlet.access
 
     @property
@@ -126,42 +127,42 @@ class SmartEvse(Device):
 
     @property
     def contactor(self) -> bool:
-        """Tell whether the contactor is closed: whether the car has voltage."""
+        """Return whether the contactor is closed: the car has voltage."""
         return self.outlet.contactor
 
     @property
     def pilot_current(self) -> float:
-        """Return what the pilot offers the car, A; 0 without PWM."""
+        """Return the current that the pilot offers, A; 0 without PWM."""
         return self.outlet.pilot_current
 
     @property
     def car_current(self) -> float:
-        """Return what the car draws, A per phase."""
+        """Return the current that the car draws, A per phase."""
         return self.outlet.car_current
 
     @property
     def writes(self) -> list[RegisterWrite]:
-        """Return all writes it understood, oldest first."""
+        """Return all well-formed writes, oldest first."""
         return self.controller.writes
 
     @property
     def eeprom_writes(self) -> Counter[int]:
-        """Return how often each register was stored in its EEPROM."""
+        """Return the number of EEPROM writes of each register."""
         return self.controller.eeprom_writes
 
     @property
     def broadcasts(self) -> list[BalanceBroadcast]:
-        """Return the charge currents it heard as a slave."""
+        """Return the charge currents received as a slave."""
         return self.controller.broadcasts
 
     @property
     def requests_sent(self) -> list[Handshake]:
-        """Return what it asked its master for (01 to 04)."""
+        """Return the requests to its master (01 to 04)."""
         return self.controller.requests_sent
 
     @property
     def answers(self) -> list[Handshake]:
-        """Return the acknowledgements it heard (81 to 84)."""
+        """Return the acknowledgements received (81 to 84)."""
         return self.controller.answers
 
     def stats(self) -> dict[str, object]:
@@ -183,7 +184,7 @@ class SmartEvse(Device):
             "car_current": round(self.car_current, 2),
         }
 
-    # What a test does
+    # For tests: events
 
     @on_bus_thread
     def press_access(self) -> None:
@@ -197,7 +198,7 @@ class SmartEvse(Device):
 
     @on_bus_thread
     def set_by_somebody(self, amps: float) -> None:
-        """Let somebody else override the charging current; 0 ends that."""
+        """Override the charging current (A) as another client would; 0 ends it."""
         self.outlet.override = round(amps * 10)
 
     @on_bus_thread
@@ -214,7 +215,7 @@ class SmartEvse(Device):
     # On the bus
 
     def step(self) -> None:
-        """Bring the box up to now; say what it wants to say."""
+        """Bring the box up to now; send its unsolicited frames."""
         self.controller.step(self.now())
         self._speak()
 
@@ -222,15 +223,15 @@ class SmartEvse(Device):
         bus, sending = self.bus, self.controller.sending
         while sending and bus is not None:
             data = sending.pop(0)
-            # Boxes are not in step with each other, although our ticks are; those that
-            # wait for the same silence do not notice it at the same moment.
+            # Real boxes do not run in step, as our ticks do, and do not detect the same
+            # silence at the same moment.
             wait = bus.rng.random() * self.jitter if data[0] == self.unit else 0.0
             silence = ANSWER_SILENCE + EPSILON + bus.rng.random() * SPREAD
             self.unasked += 1
             self.send(data, wait, silence)
 
     def hear(self, segment: Segment) -> None:
-        """Hear bytes: more than 3 ms of silence end a frame."""
+        """Receive bytes: more than 3 ms of silence end a frame."""
         bus = self.bus
         if bus is None:
             return
@@ -250,8 +251,8 @@ class SmartEvse(Device):
         bus = self.bus
         if bus is None:
             return
-        # Bytes reach us a run at a time: one that began meanwhile belongs to this
-        # frame if it began soon enough.
+        # Bytes arrive in whole runs: a run that has begun meanwhile belongs to this
+        # frame if it began in time.
         if not bus.wire.begun_before(self._heard_until + FRAME_GAP, self.name):
             self._take_frame()
 

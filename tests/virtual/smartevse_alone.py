@@ -1,6 +1,6 @@
-"""A SmartEVSE without wire and thread: frames in, frames out, in a time of its own.
+"""A SmartEVSE without wire and thread: frames in, frames out, in simulated time.
 
-For tests of what a box does; minutes of it take milliseconds.
+For tests of its behaviour; minutes take milliseconds.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ ANSWER_HEAD = 3
 
 
 class SmartEvseAlone:
-    """A box alone: `now` in s, `sent` = what it sent unasked, and when."""
+    """A box alone: `now` in s, `sent`: unsolicited frames and their times."""
 
     def __init__(
         self,
@@ -57,7 +57,7 @@ class SmartEvseAlone:
 
     @property
     def outlet(self) -> SmartEvseOutlet:
-        """Return the inside."""
+        """Return its outlet."""
         return self.box.outlet
 
     @property
@@ -74,18 +74,18 @@ class SmartEvseAlone:
             self._collect()
 
     def pilot(self, volts: int, seconds: float = 0.5) -> None:
-        """Put the pilot to that voltage, and wait."""
+        """Set the voltage of the pilot, and wait."""
         self.outlet.pilot_voltage = volts
         self.live(seconds)
 
     def hear(self, data: bytes) -> bytes | None:
-        """Let it hear a frame; return its answer."""
+        """Send it a frame; return its reply."""
         answer = self.box.receive(data, self.now)
         self._collect()
         return answer
 
     def read(self, register: int, count: int = 1, function: int = 4) -> list[int]:
-        """Read; nothing is returned for silence and for refusals."""
+        """Read registers; the list is empty for silence and for refusals."""
         answer = self.hear(read_frame(self.box.unit, register, count, function))
         if answer is None or answer[2] != 2 * count:
             return []
@@ -94,7 +94,7 @@ class SmartEvseAlone:
         return [int.from_bytes(body[i : i + 2], "big") for i in pairs]
 
     def write(self, register: int, *values: int, function: int = 16) -> str:
-        """Write; return "ok", "silence" or "refused 2"."""
+        """Write registers; return "ok", "silence" or "refused 2"."""
         unit = self.box.unit
         if function == WRITE_ONE:
             request = good = write_frame(unit, register, values[0])

@@ -1,7 +1,7 @@
-"""What a virtual SmartEVSE v2 makes of frames: registers, refusals, silence.
+"""The frames of a virtual SmartEVSE v2: registers, refusals, silence.
 
 Frames in, frames out, and the devices' time: no wire and no thread, so that it also
-works where time is simulated.
+works in simulated time.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ VOLATILE_MODE_2_17 = 0xA8
 class SmartEvseController:
     """The controller of one box, with its outlet.
 
-    `override_works`, `ignore_access`: defects, or what an earlier firmware lacks.
-    `receive` a frame at a time; `step`, and send what is then in `sending`.
+    `override_works`, `ignore_access`: defects, or missing in an earlier firmware.
+    `receive` takes one frame; after `step`, `sending` has the frames to send.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class SmartEvseController:
 
     @property
     def unit(self) -> int:
-        """Return its address: the load-balance setting, if there is one."""
+        """Return its address: the load-balance setting, if load balancing is on."""
         return self.outlet.load_balance or self.unit_when_disabled
 
     def power_cycle(self) -> None:
@@ -90,7 +90,7 @@ class SmartEvseController:
         self._last_request = None
 
     def step(self, now: float) -> None:
-        """Live until `now`; what it wants to say is then in `sending`."""
+        """Advance to `now`; the frames to send are then in `sending`."""
         self.now = now
         out = self.outlet
         cycles = out.cycles
@@ -108,7 +108,7 @@ class SmartEvseController:
             self._broadcast()
 
     def _broadcast(self) -> None:
-        """As a master: say what everybody may draw."""
+        """As a master: broadcast the charge currents."""
         sharing = self.outlet.sharing
         sharing.currents[0] = self.outlet.current
         self._say_request(
@@ -126,7 +126,7 @@ class SmartEvseController:
     # Frames
 
     def receive(self, data: bytes, now: float) -> bytes | None:
-        """Take a frame that silence has ended; return the answer, if any."""
+        """Take a frame that silence has ended; return the reply, if any."""
         self.step(now)
         packet = decode(data, self.dialect.functions)
         if packet is None or not self._is_request(packet):
@@ -139,7 +139,7 @@ class SmartEvseController:
         return answer
 
     def _is_request(self, packet: Packet) -> bool:
-        """Tell a request from somebody's answer, by what was heard or sent last."""
+        """Return whether it is a request; a reply matches the last request on the bus."""
         if packet.kind == "answer":
             self._last_request = None
             return False
@@ -172,7 +172,7 @@ class SmartEvseController:
         return self._write(packet)
 
     def _hidden(self, packet: Packet) -> bool:
-        """Tell whether the volatile mode makes the whole request vanish."""
+        """Return whether the volatile mode makes it ignore the whole request."""
         if self.dialect.gentle or packet.register != VOLATILE_MODE_2_17:
             return False
         return self.outlet.disabled or self.outlet.settings["mode"] == NORMAL
@@ -187,7 +187,7 @@ class SmartEvseController:
         return values_frame(packet.unit, packet.function, values)
 
     def value_of(self, item: str | Setting) -> int:
-        """Return what a register holds."""
+        """Return the value of a register."""
         out = self.outlet
         if isinstance(item, Setting):
             return out.settings[item.name]
@@ -232,7 +232,7 @@ class SmartEvseController:
         return frame(unit, function, words(packet.register, taken))
 
     def _set_all(self, packet: Packet, items: tuple[str | Setting, ...]) -> int:
-        """Set what lies there; store it if it is a setting; count what was taken."""
+        """Set these registers, store settings; return the number of values accepted."""
         taken = 0
         stored = False
         for index, (item, value) in enumerate(zip(items, packet.values, strict=False)):
@@ -262,14 +262,14 @@ class SmartEvseController:
         )
 
     def _set(self, item: str | Setting, value: int) -> bool:
-        """Set a register; return what the box believes came of it."""
+        """Set a register; return whether the box reports it as accepted."""
         out = self.outlet
         if isinstance(item, Setting):
             taken = item.low <= value <= item.high
             if taken:
                 out.settings[item.name] = value
         elif item == "current":
-            # A 2.17 takes it and says that it did not.
+            # A 2.17 accepts it, but reports a refusal.
             taken = self.dialect.status_writable
             if self.override_works:
                 out.override = value
@@ -295,12 +295,12 @@ class SmartEvseController:
         return True
 
     def _set_status(self, item: str, value: int) -> bool:
-        """Set what a master of a later dialect may set in its nodes."""
+        """Set a register that only the master of a later dialect writes."""
         out = self.outlet
         if item == "state":
             names = {code: name for name, code in self.dialect.states.items()}
             state = names.get(value, "A")
-            # "Granted": the node goes on by itself.
+            # "Granted": the node makes the transition itself.
             out.go({"F+": "B", "G+": "C"}.get(state, state))
         elif item == "error":
             out.set_error(value)
@@ -317,7 +317,7 @@ class SmartEvseController:
     # Load balancing
 
     def _balance(self, packet: Packet) -> bool:
-        """Hear charge currents; tell whether that is all there is to do."""
+        """Take broadcast charge currents; return whether the frame needs no reply."""
         if packet.register != self.dialect.balance_register or not self.outlet.slave:
             return False
         index = self.outlet.load_balance - 1
@@ -336,7 +336,7 @@ class SmartEvseController:
         return True
 
     def _acknowledge(self, packet: Packet) -> bool:
-        """As a master of 2.17: answer a slave's request; tell whether it was one."""
+        """As a master of 2.17: reply to a slave's request; return whether it was one."""
         if self.outlet.load_balance != MASTER or self.dialect.status_writable:
             return False
         slave = MASTER < packet.unit <= self.dialect.units
@@ -349,7 +349,7 @@ class SmartEvseController:
         return True
 
     def _handshake(self, packet: Packet) -> None:
-        """Hear an error broadcast or an acknowledgement: never answered."""
+        """Take an error broadcast or an acknowledgement: neither has a reply."""
         if packet.function != WRITE_ONE:
             return
         out = self.outlet

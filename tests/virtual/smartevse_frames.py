@@ -1,8 +1,7 @@
-"""Modbus RTU as a SmartEVSE v2 speaks and understands it: pure functions.
+"""Modbus RTU as a SmartEVSE v2 implements it: pure functions.
 
-What a frame is, a box decides by silence alone; what kind of frame it is, by its
-length; whether a write of one register is a request or somebody's answer, by what it
-heard last.
+A box finds the end of a frame by silence alone, and the kind of a frame by its length.
+A write of one register is a request or a reply: that depends on the frame before.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ READS = (READ_HOLDING, READ_INPUT)
 LONGEST = 50
 SHORTEST = 8
 EXCEPTION_LENGTH = 5
-# More than this much silence ends a frame; it answers after more than the other.
+# More silence than this ends a frame, s; and the silence before a reply, s.
 FRAME_GAP = 0.003
 ANSWER_SILENCE = 0.006
 
@@ -54,7 +53,7 @@ def read_frame(unit: int, register: int, count: int, function: int = 4) -> bytes
 
 
 def write_frame(unit: int, register: int, value: int) -> bytes:
-    """Return a request to write one register (06), or its answer."""
+    """Return a request to write one register (06), or the reply to it."""
     return frame(unit, WRITE_ONE, words(register, value))
 
 
@@ -65,7 +64,7 @@ def write_several_frame(unit: int, register: int, *values: int) -> bytes:
 
 
 def values_frame(unit: int, function: int, values: list[int]) -> bytes:
-    """Return the answer to a read; the length byte is left out if it would be 0."""
+    """Return the reply to a read; the length byte is left out if it would be 0."""
     length = bytes((2 * len(values),)) if values else b""
     return frame(unit, function, length + words(*values))
 
@@ -77,9 +76,9 @@ def exception_frame(unit: int, function: int, code: int) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """A frame with a good checksum, as a box takes it apart.
+    """A frame with a good checksum, as a box decodes it.
 
-    `values` are the words of a write; an answer's register is not in it.
+    `values`: the words of a write. The register of a reply is not known.
     """
 
     unit: int
@@ -91,7 +90,7 @@ class Packet:
 
 
 def decode(data: bytes, functions: tuple[int, ...]) -> Packet | None:
-    """Return what a box makes of a frame, or None if it makes nothing of it."""
+    """Return a frame as a box decodes it, or None if the box ignores it."""
     if not SHORTEST <= len(data) <= LONGEST or crc16(data[:-2]) != data[-2:]:
         return None
     unit, function = data[0], data[1]
@@ -109,7 +108,7 @@ def decode(data: bytes, functions: tuple[int, ...]) -> Packet | None:
 
 
 def _decode_long(unit: int, function: int, data: bytes) -> Packet | None:
-    """Return an answer to a read, or a request to write several."""
+    """Return a reply to a read, or a request to write several."""
     if function in READS and data[2] == len(data) - 5:
         return Packet(unit, function, "answer")
     if function == WRITE_SEVERAL and data[6] == len(data) - 9:
@@ -126,7 +125,7 @@ def _split(data: bytes) -> tuple[int, ...]:
 
 @dataclass(frozen=True, slots=True)
 class SmartEvseRequest:
-    """A well-formed request somebody sent: real times of its first byte and its end.
+    """A well-formed request on the wire: real times of its first byte and its end.
 
     `count` registers; `values` are empty for a read.
     """
@@ -143,11 +142,11 @@ class SmartEvseRequest:
 def smartevse_requests_in(
     traffic: VirtualBus | Iterable[Entry],
 ) -> list[SmartEvseRequest]:
-    """Return all well-formed requests a client sent, whoever was addressed.
+    """Return all well-formed requests of a client, for any address.
 
-    The witness: `smartevse_requests_in(bus)`, or of logged entries as
-    `bus.log.bursts("injected")`. Frames with 3 ms or less between them are one piece of
-    nonsense, to a box and here.
+    Use it as the oracle: `smartevse_requests_in(bus)`, or with logged entries as
+    `bus.log.bursts("injected")`. Frames with 3 ms or less between them are one
+    malformed frame, to a box and here.
     """
     entries = traffic if isinstance(traffic, Iterable) else traffic.log.bursts()
     result = []

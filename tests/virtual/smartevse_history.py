@@ -1,4 +1,4 @@
-"""What a virtual SmartEVSE remembers for the tests."""
+"""Records that a virtual SmartEVSE keeps for the tests."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class RegisterWrite:
-    """A write that the box understood: when (its time), what, and what became of it.
+    """A well-formed write: its time (the box's), its values, and its outcome.
 
-    `taken`: how many registers took their value, by the box's own count; the override
-    of a 2.17 is taken although it does not count.
+    `taken`: the number of values accepted, by the box's own count; the override of a
+    2.17 is accepted although the box does not count it.
     """
 
     t: float
@@ -24,7 +24,7 @@ class RegisterWrite:
 
 @dataclass(frozen=True, slots=True)
 class BalanceBroadcast:
-    """Charge currents heard from a master: when (box's time), and 0.1 A per unit."""
+    """Charge currents received from a master: the box's time, and 0.1 A per unit."""
 
     t: float
     currents: tuple[int, ...]

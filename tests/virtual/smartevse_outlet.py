@@ -14,7 +14,7 @@ from .smartevse_registers import (
 )
 from .smartevse_states import CHARGE_DELAY, NEVER, STOP_DELAY, SmartEvseStates, pwm_of
 
-# Times in seconds of the devices' time. The recorded box's second is a little short.
+# In device time, s. A second of the recorded box is a little short.
 STEP = 0.01
 SECOND = 0.989
 COMM_TIMEOUT = 10
@@ -24,12 +24,12 @@ POLLING = 0.1
 
 
 class SmartEvseOutlet(SmartEvseStates):
-    """One outlet that lives: `step` brings it up to a time."""
+    """One outlet with a clock: `step` brings it up to a time."""
 
     # Time
 
     def step(self, now: float) -> None:
-        """Live until `now`."""
+        """Advance to `now`."""
         if self._now is None or self._second_at is None:
             self._now = now
             self._second_at = now + SECOND
@@ -112,7 +112,7 @@ class SmartEvseOutlet(SmartEvseStates):
             self.charge_delay = CHARGE_DELAY
 
     def _run_cycle(self, now: float) -> None:
-        """Every two seconds, unless somebody else is master: set the current."""
+        """Set the current every two seconds, unless there is another master."""
         if self.slave or (self.dialect.external_master and self.external_master):
             return
         if self._cycle:

@@ -1,7 +1,7 @@
 """The registers of the three SmartEVSE dialects, as tables.
 
-The manual's C and E tables do not fit the firmware that was recorded; the order here
-is the recorded one.
+The C and E tables of the manual do not match the recorded firmware; the order here is
+that of the recording.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ LESS_6A, NO_COMM, TEMP_HIGH, NO_CURRENT, RCD, NO_SUN = (1 << bit for bit in rang
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """A stored setting: name, range, and the value it is delivered with."""
+    """A stored setting: name, range and factory value."""
 
     name: str
     low: int
@@ -33,13 +33,13 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Registers in a row: of the status (names only) or of stored settings."""
+    """Registers in a row: status (names only) or stored settings."""
 
     start: int
     items: tuple[str | Setting, ...]
 
     def find(self, register: int, count: int) -> tuple[str | Setting, ...] | None:
-        """Return what lies there, or None if that reaches beyond the block."""
+        """Return the items of these registers, or None if not all are in the block."""
         first = register - self.start
         if 0 <= first < len(self.items) and first + count <= len(self.items):
             return self.items[first : first + count]
@@ -48,12 +48,12 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class Dialect:
-    """What one firmware understands.
+    """The frames and registers of one firmware.
 
-    `unit_when_disabled`: its address without load balancing; `gentle`: it asks the car
-    to stop (C1, B1) before it opens the contactor; `external_master`: foreign requests
-    stop its own cycle; `balance_register`: where a master broadcasts currents;
-    `silent`: write-only registers that are never answered.
+    `unit_when_disabled`: its address without load balancing; `gentle`: it stops the car
+    by the pilot (C1, B1) before it opens the contactor; `external_master`: requests of
+    another master stop its own cycle; `balance_register`: for the charge currents that
+    a master broadcasts; `silent`: write-only registers without a reply.
     """
 
     name: str
@@ -70,7 +70,7 @@ class Dialect:
     status_writable: bool = True
 
     def find(self, register: int, count: int) -> tuple[str | Setting, ...] | None:
-        """Return what lies in these registers, or None for an unmapped one."""
+        """Return the items of these registers, or None for an unmapped one."""
         for block in self.blocks:
             found = block.find(register, count)
             if found is not None:
@@ -129,7 +129,7 @@ _CUSTOM_2_20 = _custom(
     "energy",
     "energy_divisor",
 )
-# F and G wait for the master, for B and C; with a + he has granted it.
+# F and G wait for the master to grant B and C; F+ and G+ are granted.
 _LATER_STATES = ("A", "B", "C", "D", "F", "F+", "G", "G+", "T", "B1", "C1")
 
 V2_17 = Dialect(

@@ -1,4 +1,4 @@
-"""The states of a virtual SmartEVSE v2, and what the pilot does to them. No clock.
+"""The states of a virtual SmartEVSE v2, and their changes by the pilot. No clock.
 
 Written from the manual, the recorded trace, and the facts in the README.
 """
@@ -23,7 +23,7 @@ from .smartevse_sharing import Sharing
 if TYPE_CHECKING:
     from .car import Car
 
-# Times in seconds of the devices' time.
+# In device time, s.
 DEBOUNCE = 0.01
 CABLE_MEASUREMENT = 0.09
 ACK_TIMEOUT = 0.98
@@ -42,17 +42,17 @@ WAITING = {"E": 0x01, "F": 0x02, "G": 0x03, "H": 0x04}
 
 
 def pwm_of(tenths: int) -> float:
-    """Return what the pilot signals, A, for a current in 0.1 A: nonsense is 6 A."""
+    """Return the current that the pilot signals, A, for 0.1 A; out of range: 6 A."""
     return (tenths if LOWEST_PWM <= tenths <= HIGHEST_PWM else LOWEST_PWM) / 10
 
 
 class SmartEvseStates:
-    """One outlet without a clock of its own. Plain attributes may be set anywhere, at any time.
+    """One outlet without a clock of its own; plain attributes may be set at any time.
 
     - `settings`: the stored settings by name; `override` and `current` in 0.1 A
     - `access`, `error` (bits), `state`, `contactor` (closed or not)
-    - `pilot_current`: what the pilot signals, A; 0 = no PWM
-    - `pilot_voltage`: 12, 9 or 6 = what the pilot shows, in place of the car's doing
+    - `pilot_current`: the current that the pilot signals, A; 0 = no PWM
+    - `pilot_voltage`: 12, 9 or 6 V on the pilot in place of the car's; None: the car's
     - `temperature` in degrees; `meter_works`, `meter_leaves` (A) of its mains meter,
       which it has in the modes smart and solar
     """
@@ -81,7 +81,7 @@ class SmartEvseStates:
         self.car_current = 0.0
         self._offered = False
         self.energy_wh = 0.0
-        # (register, value) to send: of a slave to its own address.
+        # (register, value) to send: a slave's requests, to its own address.
         self.asked: list[tuple[int, int]] = []
         self.error_broadcasts: list[int] = []
         self.cycles = 0
@@ -89,7 +89,7 @@ class SmartEvseStates:
         self.power_up()
 
     def power_up(self) -> None:
-        """Begin with what is stored: volatile things are forgotten."""
+        """Begin with the stored settings: all volatile state is lost."""
         self.settings = dict(self.stored)
         self.state = "A"
         self.access = False
@@ -126,22 +126,22 @@ class SmartEvseStates:
 
     @property
     def disabled(self) -> bool:
-        """Tell whether load balancing is off."""
+        """Return whether load balancing is off."""
         return self.load_balance == DISABLED
 
     @property
     def slave(self) -> bool:
-        """Tell whether a master says what may be drawn."""
+        """Return whether a master sets its current."""
         return self.load_balance > MASTER
 
     @property
     def own_maximum(self) -> int:
-        """Return min(configured, cable) in 0.1 A, as it asks for it."""
+        """Return min(configured, cable) in 0.1 A, as in its requests."""
         return 10 * min(self.settings["max_current"], self.cable_measured)
 
     @property
     def pilot(self) -> int:
-        """Return the pilot's voltage: 12 nobody, 9 connected, 6 asking."""
+        """Return the voltage of the pilot: 12 no car, 9 connected, 6 requesting."""
         if self.pilot_voltage is not None:
             return self.pilot_voltage
         car = self.car
@@ -155,11 +155,11 @@ class SmartEvseStates:
         return CHARGING if holds or car.current > 0 else CONNECTED
 
     def open_access(self) -> None:
-        """Open access unless a switch decides; every save of settings does it."""
+        """Open access unless a switch decides; done whenever settings are stored."""
         if self.settings["switch"] not in (1, 2):
             self.access = True
 
-    # What others do to it
+    # Events from outside
 
     def set_access(self, allowed: bool) -> None:  # noqa: FBT001 - a register's value
         """Set the access bit."""
@@ -200,7 +200,7 @@ class SmartEvseStates:
             self.error &= ~RCD
 
     def go(self, state: str) -> None:
-        """Change the state and do what belongs to it at once."""
+        """Change the state, with its immediate effects."""
         self.state = state
         self._next = ""
         if state in ("A", "B1"):
@@ -230,7 +230,7 @@ class SmartEvseStates:
         return now - self._next_since >= seconds
 
     def _follow_pilot(self, now: float) -> None:
-        """Do what the pilot's voltage asks for."""
+        """Change the state by the voltage of the pilot."""
         pilot = self.pilot
         if self.state in ("A", "B1") or (
             self.state == "F" and self.dialect.status_writable
@@ -319,7 +319,7 @@ class SmartEvseStates:
             self.go("A")
 
     def _ask(self, waiting: str, now: float) -> None:
-        """Ask the master, and wait; later dialects wait to be read."""
+        """Send a request to the master, and wait; later dialects wait to be polled."""
         self.state = waiting
         self._next = ""
         self._asked_at = now
@@ -339,12 +339,12 @@ class SmartEvseStates:
             self._ask(self.state, now)
 
     def _lack(self) -> None:
-        """Say that there is not enough; the 2.17 waits with the reason."""
+        """Set the error of too little current; the 2.17 sets the reason later."""
         lacking = NO_SUN if self.settings["mode"] == SOLAR else LESS_6A
         self.error |= lacking if self.dialect.status_writable else NO_CURRENT
 
     def _enough(self) -> bool:
-        """Tell whether there is enough to begin with, for its meter and as a master."""
+        """Return whether meter and load balancing leave enough current to start."""
         if self.load_balance == MASTER and not self.sharing.available():
             return False
         return self._meter_leaves_enough()

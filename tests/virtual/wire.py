@@ -1,7 +1,7 @@
-"""The pair of wires: one byte at a time, at the line's pace, and no mercy.
+"""The wires of the bus: one byte at a time, at the pace of the line.
 
 Everything is scheduled by absolute time, so that errors of single timers do not add
-up. Bytes that overlap in time garble each other, whoever sent them.
+up. Bytes that overlap in time garble each other, for any senders.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from .loop import PreciseLoop
 
 EPSILON = 1e-6
-# Two drivers against each other: no receiver sees either byte. The constant keeps two
-# equal bytes from cancelling their collision out.
+# Two drivers at once: no receiver gets either byte. The mask garbles also two equal
+# bytes.
 COLLISION_MASK = 0x55
 
 
@@ -39,18 +39,18 @@ class Transmission:
 
     @property
     def next_start(self) -> float:
-        """Return when the next byte begins."""
+        """Return the time at which the next byte begins."""
         return self.start + self.position * self.byte_time
 
     @property
     def end(self) -> float:
-        """Return when the last byte is over."""
+        """Return the end of the last byte."""
         return self.start + len(self.data) * self.byte_time
 
 
 @dataclass(slots=True)
 class Segment:
-    """Bytes heard in a row, with the silence before them."""
+    """Bytes received in a row, with the silence before them (s)."""
 
     start: float
     byte_time: float
@@ -60,7 +60,7 @@ class Segment:
 
     @property
     def end(self) -> float:
-        """Return when the last byte was over."""
+        """Return the end of the last byte."""
         return self.start + len(self.data) * self.byte_time
 
 
@@ -76,10 +76,10 @@ class Wire:
         *,
         duplex: bool = False,
     ) -> None:
-        """Make a silent wire; `attach` gives it a loop and ears.
+        """Make a silent wire; `attach` connects it.
 
-        With `duplex` (RS-232) there is a wire for each direction: the client's bytes
-        and the devices' do not disturb each other.
+        With `duplex` (RS-232) each direction has its own wire: bytes of the client and
+        of the devices do not collide.
         """
         self.byte_time = byte_time
         self.duplex = duplex
@@ -112,37 +112,37 @@ class Wire:
 
     @property
     def idle_from(self) -> float:
-        """Return when everything on the wire, or due to be, is over."""
+        """Return the end of all transmissions, scheduled ones included."""
         return max([self._last_end, *(t.end for t in self._active)])
 
     def free_from(self, source: str) -> float:
-        """Return when the last transmission of one sender is over."""
+        """Return the end of the last transmission of one sender."""
         ends = (t.end for t in self._active if t.source == source)
         return max(ends, default=float("-inf"))
 
     def audible_until(self, now: float) -> float:
-        """Return the end of what a listener knows of at `now`.
+        """Return the end of the transmissions that a listener can detect at `now`.
 
-        A byte is heard when it is over: who begins before that collides.
+        A byte is received at its end: a sender that begins before that collides.
         """
         heard = [t.end for t in self._active if t.start + t.byte_time <= now]
         return max([self._last_end, *heard])
 
     @property
     def last_end(self) -> float:
-        """Return when the last byte heard was over."""
+        """Return the end of the last byte received."""
         return self._last_end
 
     def begun_before(self, at: float, listener: str) -> bool:
-        """Tell whether somebody else who is still sending had begun by then."""
+        """Return whether another transmission that still goes on had begun by then."""
         return any(t.start <= at and t.source != listener for t in self._active)
 
     def busy(self, now: float) -> bool:
-        """Tell whether somebody is sending right now."""
+        """Return whether there is a transmission now."""
         return any(t.start <= now < t.end for t in self._active)
 
     def send_client(self, data: bytes) -> None:
-        """Take bytes the client wrote: they leave its UART one by one."""
+        """Take bytes that the client wrote: they leave its UART one by one."""
         if self._loop is None:
             return
         start = max(self._loop.time(), self._client_free)
@@ -164,7 +164,7 @@ class Wire:
         self._schedule()
 
     def drop_pending(self) -> None:
-        """Stop all senders at once; what they sent so far is logged."""
+        """Stop all senders at once; the bytes sent so far are logged."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -173,7 +173,7 @@ class Wire:
         self._active.clear()
 
     def _schedule(self) -> None:
-        """Set the timer to the next moment something is to be delivered."""
+        """Set the timer to the next delivery."""
         if not self._active or self._loop is None:
             return
         when = min(self._due(t) for t in self._active)
@@ -186,7 +186,7 @@ class Wire:
 
     def _due(self, transmission: Transmission) -> float:
         if transmission.source == CLIENT and not self.faults.echo:
-            # Nobody reads along: devices get a whole run of bytes at its end.
+            # Without an echo only devices receive them: a whole run of bytes at its end.
             return transmission.end
         chunk_end = transmission.position + self._chunk
         return min(
@@ -194,7 +194,7 @@ class Wire:
         )
 
     def _pump(self) -> None:
-        """Move on everything whose time has come."""
+        """Deliver everything that is due."""
         self._timer = None
         if self._loop is None:
             return
@@ -216,7 +216,7 @@ class Wire:
         self._schedule()
 
     def _step(self, now: float) -> bool:
-        """Carry the earliest bytes; False if none is complete by now."""
+        """Carry the earliest bytes; return False if none is complete by now."""
         first = min(self._active, key=lambda t: t.next_start)
         others = [t for t in self._active if t is not first and self._meet(t, first)]
         bt = first.byte_time
@@ -240,13 +240,13 @@ class Wire:
         return True
 
     def _meet(self, one: Transmission, other: Transmission) -> bool:
-        """Tell whether two transmissions use the same wire."""
+        """Return whether two transmissions use the same wire."""
         return not self.duplex or (one.source == CLIENT) == (other.source == CLIENT)
 
     def _collide(
         self, first: Transmission, others: list[Transmission], start: float
     ) -> None:
-        """Garble one byte with all that begin before it is over."""
+        """Garble one byte with all that begin before its end."""
         value = first.data[first.position] ^ COLLISION_MASK
         together = [first]
         for other in others:

@@ -1,9 +1,9 @@
 """Frames of the EVBox Protocol Max v4: commands 68 and 69. Pure functions.
 
-A frame is ``STX destination source command data SUM XOR ETX``; everything
-between STX and ETX is upper-case ASCII hex. Both checksums are over those ASCII
-characters, not over the bytes they stand for (PROTOCOLS.md section 1: only so
-the manual's command 69 request gives its printed F703).
+A frame is ``STX destination source command data SUM XOR ETX``; everything between STX
+and ETX is upper-case ASCII hex. Both checksums are over those ASCII characters, not
+over the bytes they stand for (PROTOCOLS.md section 1: this gives the F703 printed
+under the command 69 request of the manual).
 """
 
 from collections.abc import Mapping
@@ -129,7 +129,7 @@ def encode_68(
 ) -> bytes:
     """Return a request 68; ValueError for an invalid serial or information module."""
     if not 0 <= serial <= LARGEST_SERIAL:
-        message = f"serial number {serial} has no 8 digits"
+        message = f"serial number {serial} does not fit 8 digits"
         raise ValueError(message)
     if len(information) != INFORMATION_LENGTH:
         message = f"information module of {len(information)} bytes, not 16"
