@@ -203,19 +203,35 @@ def _parser() -> argparse.ArgumentParser:
     abl = kinds.add_parser("abl", help="ABL EVCC2/3 boxes")
     _common(abl.add_argument)
     add = abl.add_argument
-    add("--ids", type=int, nargs="+", default=[1], help="device-IDs; twice = two boxes")
+    add(
+        "--ids",
+        type=int,
+        nargs="+",
+        default=[1],
+        help="device-IDs; an ID twice: two boxes",
+    )
     add("--no-meter", action="store_true", help="no phase-current meter")
     add("--default-current", type=float, default=16.0, metavar="A")
     add("--sleep", type=float, metavar="S", help="sleep after S seconds of silence")
-    add("--upstream-timeout", type=float, metavar="S", help="F4 when nobody polls")
-    add("--extra-registers", action="store_true", help="answer 0x04 and 0x0F too")
+    add("--upstream-timeout", type=float, metavar="S", help="F4 without polling")
+    add(
+        "--extra-registers",
+        action="store_true",
+        help="registers 0x04 and 0x0F can be read too",
+    )
     add("--turn-round", type=float, default=0.002, metavar="S")
     add("--l3-first", action="store_true", help="phase order L3, L2, L1")
     evbox = kinds.add_parser("evbox", help="EVBox ChargePoints (Protocol Max v4)")
     _common(evbox.add_argument)
     add = evbox.add_argument
     add("--serials", type=int, nargs="+", default=[1923054])
-    add("--modules", type=int, nargs="+", default=[1], help="a number a ChargePoint")
+    add(
+        "--modules",
+        type=int,
+        nargs="+",
+        default=[1],
+        help="one number for each ChargePoint",
+    )
     add("--max-current", type=float, default=35.0, metavar="A")
     add("--min-current", type=float, default=6.0, metavar="A")
     add("--min-interval", type=int, default=1, metavar="S")
@@ -230,16 +246,18 @@ def _parser() -> argparse.ArgumentParser:
         nargs="+",
         default=[0],
         metavar="N",
-        help="a box each: 0 off, 1 master, 2 to 8 slaves; it is also the address",
+        help="for each box: 0 off, 1 master, 2 to 8 slaves; also its address",
     )
-    add("--unit", type=int, help="address with load balancing off, if not the usual")
+    add("--unit", type=int, help="address with load balancing off, if not the default")
     add("--cables", type=int, nargs="+", default=[16], choices=[13, 16, 32, 63])
-    add("--fixed-cable", action="store_true", help="no socket: --max-current holds")
+    add("--fixed-cable", action="store_true", help="no socket: --max-current counts")
     add("--max-current", type=int, default=13, metavar="A")
     add("--min-current", type=int, default=6, metavar="A")
     add("--mode", type=int, choices=[0, 1, 2], default=0, help="normal, smart, solar")
     add("--serial", type=int, default=1, help="of the first box; dialect later only")
-    add("--no-override", action="store_true", help="ignores a charging current")
+    add(
+        "--no-override", action="store_true", help="the boxes ignore a charging current"
+    )
     add("--turn-round", type=float, default=0.01, metavar="S")
     ews = kinds.add_parser("ews", help="P-CHARGE EWS-Boxes (MCS binary)")
     _common(ews.add_argument)
@@ -270,15 +288,25 @@ def _common(add: Callable[..., object]) -> None:
     add(
         "--time-scale", type=float, default=1.0, help="cars and time-outs, not the wire"
     )
-    add("--granularity", type=float, default=0.002, help="seconds a chunk of a reply")
+    add(
+        "--granularity",
+        type=float,
+        default=0.002,
+        help="seconds for each chunk of a reply",
+    )
     add("--seed", type=int, default=0)
     add("--dead", type=int, nargs="+", default=[], help="IDs, units or serials")
-    add("--error-rate", type=float, default=0.0, help="a byte's chance to be damaged")
-    add("--lose-rate", type=float, default=0.0, help="a reply's chance to be lost")
-    add("--late-rate", type=float, default=0.0, help="a reply's chance to be late")
+    add(
+        "--error-rate",
+        type=float,
+        default=0.0,
+        help="probability that a byte is damaged",
+    )
+    add("--lose-rate", type=float, default=0.0, help="probability that a reply is lost")
+    add("--late-rate", type=float, default=0.0, help="probability that a reply is late")
     add("--late-by", type=float, default=0.5, metavar="S")
     add("--noise-rate", type=float, default=0.0, help="noise bytes per second")
-    add("--echo", action="store_true", help="the adapter echoes what it sends")
+    add("--echo", action="store_true", help="the adapter echoes the client's bytes")
     add("--control", action="store_true", help=f"read commands from stdin: {HELP}")
     add("--duration", type=float, metavar="S", help="end after S seconds")
     add("--stats", metavar="FILE", help="write the counters as JSON at the end")

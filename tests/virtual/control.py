@@ -79,7 +79,7 @@ class Control:
         elif isinstance(device, SmartEvse):
             self._smartevse_command(word, device, values)
         elif not isinstance(device, AblBox):
-            msg = f"{word} is nothing for {device.name}"
+            msg = f"{device.name} has no command {word}"
             raise TypeError(msg)
         elif word == "fail":
             device.fail(int(values[0]))
