@@ -213,7 +213,12 @@ def _parser() -> argparse.ArgumentParser:
     add("--no-meter", action="store_true", help="no phase-current meter")
     add("--default-current", type=float, default=16.0, metavar="A")
     add("--sleep", type=float, metavar="S", help="sleep after S seconds of silence")
-    add("--upstream-timeout", type=float, metavar="S", help="F4 without polling")
+    add(
+        "--upstream-timeout",
+        type=float,
+        metavar="S",
+        help="F4 after S seconds without polling",
+    )
     add(
         "--extra-registers",
         action="store_true",

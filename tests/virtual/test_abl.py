@@ -1,4 +1,4 @@
-"""The virtual ABL box against the manual's and real boxes' bytes."""
+"""The virtual ABL box against bytes of the manual and of real boxes."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_answers_of_real_boxes() -> None:
         line(":", bytes.fromhex("011000140001 0400A600A6")),  # bytes and registers
         line(":", bytes.fromhex("011000140002 0400A600A6")),  # two registers
         read(0x2E, 5, box=2),
-        read(0x2E, 5, box=0),  # no broadcast for this one
+        read(0x2E, 5, box=0),  # not readable by broadcast
         read(0x2E, 5).replace(b":", b">"),
         read(0x2E, 5).lower(),
     ],
@@ -138,7 +138,7 @@ def test_broadcast() -> None:
         assert client.read(1, SILENT) == b""
         assert box.writes[0].broadcast
         assert box.limits_written == [166]
-        # "Broadcast supported: yes" for a read can only mean an answer.
+        # "Broadcast supported: yes" for a read can only mean a reply.
         assert client.ask(read(0x01, 2, box=0)).startswith(b">07030401")
 
 
@@ -214,7 +214,7 @@ def test_e0_hides_the_cable() -> None:
         assert car.current == 0
 
 
-def test_new_device_id_holds_after_the_reset() -> None:
+def test_a_new_device_id_takes_effect_after_the_reset() -> None:
     box = AblBox(1, boot_time=0.05)
     with line_to(box) as (bus, client):
         assert client.ask(write(0x2C, 0xF005)) == FAILED
@@ -237,7 +237,7 @@ def test_new_device_id_holds_after_the_reset() -> None:
         assert client.ask(READ_FULL, timeout=SILENT) == b""
 
 
-def test_icmax_does_not_survive() -> None:
+def test_icmax_is_lost_with_the_power() -> None:
     box = AblBox(1, boot_time=0.01)
     with line_to(box) as (bus, client):
         client.ask(SET_10_A)
@@ -296,7 +296,7 @@ def test_the_first_request_after_a_sleep_is_lost(wakes_on: str) -> None:
         assert box.lost_asleep == 2
 
 
-def test_traffic_for_others_keeps_awake_only_if_so_set() -> None:
+def test_other_traffic_keeps_awake_only_if_configured() -> None:
     lazy = AblBox(2, sleep_after=30, wakes_on="own", wake_time=0.01)
     light = AblBox(3, sleep_after=30, wakes_on="any", wake_time=0.01)
     with line_to(AblBox(1), lazy, light) as (_, client):
@@ -378,7 +378,7 @@ def test_extra_registers() -> None:
         assert int.from_bytes(data[6:8], "big") & 0x0FFF == 166
 
 
-def test_the_log_is_a_witness() -> None:
+def test_the_log_is_an_oracle() -> None:
     with line_to(AblBox(1)) as (bus, client):
         client.ask(SET_10_A)
         client.write(write(0x14, 500, box=9))

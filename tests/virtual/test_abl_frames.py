@@ -1,4 +1,4 @@
-"""Checksums and duty cycles against the manual's and real boxes' bytes."""
+"""Checksums and duty cycles against bytes of the manual and of real boxes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from .abl_frames import amps_of, duty_of, lrc
         ":010300500008A4",
         ">0103105000325732327879303132333435363722",
         ":01100013000102010BCD",
-        # Manual, with the LRC put right.
+        # Manual, with the LRC corrected.
         ">01030A2EC3810A006400640000AE",
         ">0103063380C30A0A006C",
         ">011000130001DB",

@@ -37,7 +37,7 @@ def test_nothing_is_faster_than_the_wire() -> None:
             took.append(time.monotonic() - begin)
         wire = (len(READ_FULL) + len(ANSWER)) * E1_BYTE + 0.002
         assert min(took) >= wire
-        # Others use this machine too: the schedule is exact, its keeping is not.
+        # On a busy machine bytes may be late, but never early.
         assert min(took) < wire + 0.1
         request, reply = bus.log.entries[-2:]
         assert request.end - request.t == pytest.approx(17 * E1_BYTE)
@@ -53,16 +53,16 @@ def test_a_reply_comes_in_pieces_at_the_wires_pace() -> None:
         assert len(answer) == 742
         times = [t for t, _ in client.read_at]
         assert len(times) > 20
-        # 742 bytes of 10 bits; the first piece holds some of them already.
+        # 742 bytes of 10 bits; the first piece has some of them already.
         assert times[-1] - times[0] > 730 * 10 / 38400 - 0.01
         for seen, (at, _) in enumerate(client.read_at[:-1]):
             done = sum(n for _, n in client.read_at[: seen + 1])
             assert at >= bus.log.entries[1].t + done * bus.byte_time
 
 
-def test_a_client_that_talks_into_a_reply_garbles_both() -> None:
+def test_a_request_during_a_reply_garbles_both() -> None:
     box = AblBox(1)
-    # Slow, so that a busy machine still hits the middle of the reply.
+    # Slow, so that even on a busy machine the request begins within the reply.
     slow = VirtualBus.pty(box, baud=4800, parity="E")
     with slow as bus, RawClient(bus.url, "E") as client:
         client.write(READ_FULL)
@@ -176,7 +176,7 @@ def test_devices_can_come_and_go() -> None:
         assert client.ask(READ_FULL) == ANSWER
 
 
-def test_an_error_inside_is_not_swallowed() -> None:
+def test_an_error_inside_is_raised() -> None:
     class Broken(Device):
         def hear(self, segment: Segment) -> None:
             raise LookupError(segment.data.decode())
@@ -202,7 +202,7 @@ def test_stats() -> None:
     assert stats["devices"]["abl-1"]["requests"] == 1  # type: ignore[index]
 
 
-def test_nothing_of_the_integration_is_imported() -> None:
+def test_no_module_imports_the_integration() -> None:
     for path in Path(__file__).parent.glob("*.py"):
         if path.name.startswith("test_"):
             continue
@@ -219,7 +219,7 @@ def test_nothing_of_the_integration_is_imported() -> None:
                 assert name.split(".")[0] in sys.stdlib_module_names, path
 
 
-def test_frozen_time_does_not_stop_it(freezer: object) -> None:
+def test_frozen_time_does_not_stop_the_bus(freezer: object) -> None:
     assert freezer
     with VirtualBus.pty(AblBox(1)) as bus, RawClient(bus.url, "E") as client:
         assert time.monotonic() == time.monotonic()
@@ -228,7 +228,7 @@ def test_frozen_time_does_not_stop_it(freezer: object) -> None:
             bus.wait_for(lambda: False, timeout=0.02)
 
 
-async def test_a_cancelled_wait_leaves_nothing_behind() -> None:
+async def test_a_cancelled_wait_leaves_no_waiter() -> None:
     async with VirtualBus.pty(AblBox(1)) as bus:
         waiting = asyncio.create_task(bus.wait_for_async(lambda: bus.opened))
         await asyncio.sleep(0.01)

@@ -66,7 +66,7 @@ def test_abl(tmp_path: Path) -> None:
 
 
 def test_cars_that_come_and_go() -> None:
-    """Sooner than any would come of itself."""
+    """With `--away` cars come sooner than by default."""
     arguments = ["--cars", "auto", "--away", "0", "0"]
     with running("abl", *arguments) as (_, url), RawClient(url, "E") as client:
         deadline = time.monotonic() + 4
@@ -83,7 +83,7 @@ def test_evbox() -> None:
 
 
 def test_smartevse(tmp_path: Path) -> None:
-    """A slave that asks, and what somebody does at the box."""
+    """A slave that sends requests, and commands for the box's menu and button."""
     stats = tmp_path / "stats.json"
     arguments = ["--load-balance", "0", "2", "--max-current", "20", "--cables", "32"]
     arguments += ["--control", "--stats", str(stats), "--time-scale", "4"]

@@ -1,4 +1,4 @@
-"""The virtual ChargePoint against the manual's and a real box's bytes."""
+"""The virtual ChargePoint against bytes of the manual and of a real box."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def line_to(*points: EvboxChargePoint) -> Iterator[tuple[VirtualBus, RawClient]]
 
 
 def polite(bus: VirtualBus) -> None:
-    """Wait for the silence that the protocol asks for."""
+    """Wait for the silence that the protocol requires."""
     bus.wait_for(lambda: not bus.wire.busy(bus.time()))
     end = bus.wire.idle_from + 0.101
     bus.wait_for(lambda: bus.time() >= end)
@@ -80,7 +80,7 @@ def test_command_69_of_the_manual() -> None:
     point = EvboxChargePoint(1923054, two_modules(), min_interval=20)
     with line_to(point) as (_, client):
         answer = ask(client, MANUAL_69)
-        # The manual's answer, but FF32 for -0.206 as its text says.
+        # The reply in the manual, with FF32 for -0.206 as in its text.
         expected = "A080690014015E020078008C008C008C021C0140038400014C1D"
         expected += "0050" + "0000000000A0" + "0085FFBFFF32" + "000B823C"
         assert answer == expected
@@ -102,7 +102,7 @@ def test_command_68_of_the_manual() -> None:
         assert point.orders[0].serial == "01923054"
 
 
-def test_answer_of_a_real_box() -> None:
+def test_reply_of_a_real_box() -> None:
     modules = [Module(min_current=12, energy_wh=wh) for wh in (40, 30)]
     with line_to(EvboxChargePoint(1, modules)) as (_, client):
         answer = client.ask(MANUAL_69, b"\x03")
@@ -141,7 +141,7 @@ def test_stx_restarts_a_frame() -> None:
         assert ask(client, MANUAL_69[:15] + MANUAL_69).startswith("A08069")
 
 
-def test_serial_zero_and_69_address_anyone() -> None:
+def test_serial_zero_and_69_address_any_box() -> None:
     point = EvboxChargePoint(7, min_interval=0)
     with line_to(point) as (bus, client):
         assert ask(client, command(68, serial="00000000")).startswith("A0806800000007")
@@ -157,7 +157,7 @@ def test_commands_can_be_missing() -> None:
         assert ask(client, command(69))
 
 
-def test_several_answer_serial_zero_at_once() -> None:
+def test_several_boxes_reply_to_serial_zero_at_once() -> None:
     points = [EvboxChargePoint(serial, min_interval=0) for serial in (1, 2)]
     with line_to(*points) as (bus, client):
         client.write(command(68, serial="00000000"))
@@ -172,7 +172,7 @@ def test_several_answer_serial_zero_at_once() -> None:
 def test_the_reply_waits_for_silence() -> None:
     with line_to(EvboxChargePoint()) as (bus, client):
         client.write(MANUAL_69)
-        # Somebody else talks while it waits.
+        # Another station sends while it waits.
         bus.inject(b"\x02BC800000\x03", after=0.08, source="other")
         client.read_line(b"\x03")
         client.read_line(b"\x03")
@@ -243,7 +243,7 @@ def test_modules_share_the_limit() -> None:
         assert cars[0].phase_currents == (8, 8, 8)
         assert cars[2].phase_currents == (8, 0, 0)
         polite(bus)
-        # 14 A for three: one must go without, none gets less than its minimum.
+        # 14 A for three: one gets 0 A, none less than its minimum.
         ask(client, command(69, "008C008C008C" + "003C" + "000000000000"))
         bus.advance(10)
         assert [m.offered for m in point.modules] == [7, 7, 0]
@@ -297,7 +297,7 @@ def test_lies_end() -> None:
         assert ask(client, command(69)) == honest
 
 
-def test_another_one_in_its_place() -> None:
+def test_another_box_in_its_place() -> None:
     point = EvboxChargePoint(1923054, min_interval=0)
     with line_to(point) as (bus, client):
         ask(client, command(68))
@@ -318,7 +318,7 @@ def test_meter_counts_what_the_car_draws() -> None:
         assert module.energy_wh == pytest.approx(1000 + 3 * 230 * 10 / 10, rel=0.01)
 
 
-def test_the_log_is_a_witness() -> None:
+def test_the_log_is_an_oracle() -> None:
     with line_to(EvboxChargePoint(5)) as (bus, client):
         client.write(command(68, serial="00000099"))
         bus.wait_for(lambda: len(bus.log))

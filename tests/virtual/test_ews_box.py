@@ -1,4 +1,4 @@
-"""The virtual EWS-Box on a serial line: every command of the manual's reference."""
+"""The virtual EWS-Box on a serial line: every command of the reference (manual)."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ def charging(bus: VirtualBus, box: EwsBox, client: EwsClient, car: Car) -> None:
     assert box.ports[0].contactor
 
 
-def test_every_command_of_the_reference_is_there() -> None:
+def test_every_command_of_the_reference_exists() -> None:
     reference = "cr fw id ma mc oe ow rc rd rf rg ri rp rs ru rz sc se sf si sl sp st"
     assert set(COMMANDS) == {*reference.split(), "su", "sz", "zz"}
 
 
-def test_sizes_of_what_is_read() -> None:
+def test_sizes_of_the_answers() -> None:
     box = EwsBox()
     with line_to(box) as (_, client):
         assert client.ask("id") == b"M165300103\x00"
@@ -67,7 +67,7 @@ def test_bcc_without_the_message_id() -> None:
         assert [m.name for m in heard] == ["id"]
 
 
-def test_what_is_not_a_command_is_ignored() -> None:
+def test_other_messages_are_ignored() -> None:
     box = EwsBox()
     with line_to(box) as (_, client):
         for data in (
@@ -120,7 +120,7 @@ def test_status_of_a_charge() -> None:
         assert data[14:16] == bytes((10, 0))
 
 
-def test_orders_by_the_wire() -> None:
+def test_orders_on_the_wire() -> None:
     car = Car()
     box = EwsBox(cars=(car,))
     with line_to(box) as (bus, client):
@@ -241,7 +241,7 @@ def test_ten_minutes_without_a_server() -> None:
         assert box.server_timeouts == 2
 
 
-def test_ten_minutes_are_nothing_standalone() -> None:
+def test_ten_minutes_have_no_effect_in_standalone_mode() -> None:
     car = Car()
     box = EwsBox(cars=(car,), mode="standalone")
     with line_to(box) as (bus, client):
@@ -297,7 +297,7 @@ def test_one_port_only() -> None:
         assert len(client.ask("rc")) == 108
 
 
-def test_power_backup_takes_its_time() -> None:
+def test_power_backup_takes_260_seconds() -> None:
     box = EwsBox(power_backup=True)
     with line_to(box) as (bus, client):
         assert client.ask("rs")[11] & 0b1100 == 0b1100
@@ -309,7 +309,7 @@ def test_power_backup_takes_its_time() -> None:
         assert client.ports()[0]["status"] == 0
 
 
-def test_messages_for_nobody() -> None:
+def test_debug_and_application_messages() -> None:
     box = EwsBox()
     with line_to(box) as (_, client):
         box.send_debug(b"hello")
@@ -332,7 +332,7 @@ def test_an_info_record_at_every_cut_of_an_answer(where: str) -> None:
             assert len(client.unasked) == len(box.infos) == whole - 1
 
 
-def test_an_info_record_inside_an_answer_breaks_it() -> None:
+def test_an_info_record_inside_an_answer_damages_it() -> None:
     box = EwsBox()
     with line_to(box) as (bus, client):
         box.mix_info(InfoMix("inside", at=7))
@@ -357,7 +357,7 @@ def test_a_wrong_length() -> None:
 
 
 def test_both_directions_at_once() -> None:
-    """RS-232 has two wires: a record may come while a command goes."""
+    """RS-232 has two wires: a record may come while a command is sent."""
     box = EwsBox(manual_io=True, turn_round=0.0)
     with line_to(box) as (bus, client):
         for _ in range(5):

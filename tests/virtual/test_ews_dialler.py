@@ -1,4 +1,4 @@
-"""The virtual EWS-Box that dials in: connections, time-outs, and bad manners."""
+"""The virtual EWS-Box that dials in: connections, time-outs, unusual frames."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def accept(server: socket.socket) -> EwsClient:
 
 
 def gone(client: EwsClient) -> bool:
-    """Tell whether the other end has closed (not: is silent)."""
+    """Return whether the other end has closed (not: is silent)."""
     started = time.monotonic()
     try:
         data = client.read(2)
@@ -61,7 +61,7 @@ def gone(client: EwsClient) -> bool:
     return data == b"" and time.monotonic() - started < 1.5
 
 
-def test_the_box_dials_and_is_asked(server: socket.socket) -> None:
+def test_the_box_dials_and_answers(server: socket.socket) -> None:
     box = EwsBox()
     with dialling(server, box) as dialler, accept(server) as client:
         for name, size in SIZES.items():
@@ -150,7 +150,7 @@ def test_half_open(server: socket.socket) -> None:
                 old.read()
 
 
-def test_a_power_failure_says_nothing(server: socket.socket) -> None:
+def test_a_power_failure_is_silent(server: socket.socket) -> None:
     box = EwsBox()
     with dialling(server, box) as dialler, accept(server) as old:
         dialler.wait_for(lambda: dialler.connected)
@@ -254,12 +254,12 @@ def test_events_wait_for_a_server() -> None:
         with socket.create_server(address) as again, accept(again) as client:
             message = client.next(2)
             assert message
-            # Pressed anew: 255 in place of the old message; the other was let go.
+            # Pressed again: 255 in place of the old value; the other key was released.
             assert message.parameters == b"if\x00" + bytes((255, 0, 0, 0, 0, 5, 0, 0))
     assert len(box.infos) == 1
 
 
-def test_an_info_record_in_any_lump(server: socket.socket) -> None:
+def test_an_info_record_at_any_cut(server: socket.socket) -> None:
     box = EwsBox(turn_round=0.0, jitter=0.0)
     with dialling(server, box), accept(server) as client:
         for cut in range(1, 34, 3):
@@ -286,12 +286,12 @@ def test_a_card_counts_as_valid_over_the_network(server: socket.socket) -> None:
         assert client.unasked[0].parameters[2] == 1
 
 
-def test_a_standalone_box_dials_nobody() -> None:
+def test_a_standalone_box_does_not_dial() -> None:
     with pytest.raises(ValueError, match="nobody"):
         EwsDialler(EwsBox(mode="standalone"), "127.0.0.1", 1)
 
 
-def test_an_ethernet_box_tells_its_events_to_the_network_only() -> None:
+def test_an_ethernet_box_sends_its_events_to_the_network_only() -> None:
     box = EwsBox(manual_io=True)
     box.system.mode &= ~0b100
     with VirtualBus.pty(box) as bus, EwsClient.serial(bus.url) as client:

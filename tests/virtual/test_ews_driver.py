@@ -1,4 +1,4 @@
-"""A driver at the start key: asks the server, and asks anew when nobody answers."""
+"""A driver at the start key: requests a start, again if the server does not start."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Afternoon:
         box.now = lambda: self.time  # type: ignore[method-assign]
 
     def live(self, seconds: float) -> int:
-        """Return what the port says of the start then."""
+        """Advance the time; return the start mode of the port."""
         end = self.time + seconds
         while self.time < end:
             self.time += 0.05
@@ -34,7 +34,7 @@ def _afternoon(mode: str = "server") -> tuple[Afternoon, Car]:
     return Afternoon(driver, box), car
 
 
-def test_start_is_asked_for_when_the_car_wants_to_charge() -> None:
+def test_a_start_is_requested_when_the_car_requests_charge() -> None:
     afternoon, car = _afternoon()
     car.plug_in(request=False)
     assert afternoon.live(10) == 0
@@ -44,13 +44,13 @@ def test_start_is_asked_for_when_the_car_wants_to_charge() -> None:
     assert afternoon.port.status == Status.WAITING
 
 
-def test_who_is_not_answered_asks_anew() -> None:
+def test_a_request_without_a_start_is_repeated() -> None:
     afternoon, car = _afternoon()
     car.plug_in()
     assert afternoon.live(10) == 1
     assert afternoon.live(13) == 0
     assert afternoon.live(STEP_BACK) == 1
-    # Answered at last: nothing is pressed any more.
+    # Started at last: no more key is pressed.
     afternoon.port.release_start("sl 3")
     afternoon.live(60)
     assert afternoon.port.status == Status.CHARGING

@@ -1,4 +1,4 @@
-"""MCS frames against the manual's bytes, and whatever else comes along a line."""
+"""MCS frames against bytes of the manual, and arbitrary bytes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from .ews_frames import FrameReader, bcc_of, command, frame, messages_in
 from .log import Entry
 from .wire import Segment
 
-# "FW-ID? 0x02 0x0002 'C' "id" BCC"; the BCC is computed, the manual gives none.
+# "FW-ID? 0x02 0x0002 'C' "id" BCC"; the BCC is computed, the manual has none.
 ID = bytes.fromhex("02 0002 43 6964 4C")
 ID_WITHOUT = bytes.fromhex("02 0002 43 6964 0F")
 
@@ -28,7 +28,7 @@ def test_bcc_counts_length_id_and_parameters() -> None:
     assert bcc_of(b"\x00\x02", b"C", b"id", "without_msgid") == 2 ^ 0x69 ^ 0x64
 
 
-def test_only_the_right_bcc_is_heard() -> None:
+def test_only_a_correct_bcc_is_accepted() -> None:
     reader = FrameReader()
     assert not reader.feed(heard(ID_WITHOUT))
     assert reader.counters.bad_bcc == 1
@@ -61,7 +61,7 @@ def test_characters_that_wake_are_skipped() -> None:
 def test_longer_than_allowed_is_dropped() -> None:
     reader = FrameReader()
     assert len(reader.feed(heard(frame(b"C", bytes(1040))))) == 1
-    # What follows the length is noise now; none of it looks like a beginning.
+    # The bytes after the length are noise now, and have no STX.
     assert not reader.feed(heard(frame(b"C", b"\x01" * 1041)))
     assert reader.counters.too_long == 1
     assert [m.name for m in reader.feed(heard(ID))] == ["id"]

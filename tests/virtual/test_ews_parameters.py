@@ -106,7 +106,7 @@ def test_kinds_of_cards() -> None:
     assert not cards.allows(6, 1)
 
 
-def test_a_start_key_asks_the_server() -> None:
+def test_a_start_key_requests_a_start_from_the_server() -> None:
     car = Car()
     box = EwsBox(cars=(car,))
     with line_to(box) as (bus, client):
@@ -155,7 +155,7 @@ def test_the_web_page() -> None:
 
 
 def test_keys_of_the_server() -> None:
-    """Manual I/O: 255 when pressed, the time in tenths when let go."""
+    """Manual I/O: 255 when pressed, the time in tenths when released."""
     box = EwsBox(manual_io=True)
     with line_to(box) as (bus, client):
         box.press_key(2, 4, seconds=1.2)
@@ -194,7 +194,7 @@ def test_leds_of_the_server() -> None:
         assert client.ask("se", b"") == REFUSED
 
 
-def test_leds_are_the_boxs_own() -> None:
+def test_leds_of_the_box() -> None:
     car = Car()
     box = EwsBox(cars=(car,))
     with line_to(box) as (bus, client):
@@ -223,7 +223,7 @@ def test_a_card_first_then_the_key() -> None:
         one = client.ports()[0]
         assert (one["status"], one["group"], one["card"]) == (0x40, 5, 77)
         assert one["name"] == b"ANNA".ljust(8, b"\x00")
-        # Only the card that started may stop, held to the reader anew.
+        # Only the card that started may stop, presented again.
         box.press_key(1, 2)
         bus.advance(1)
         assert client.ports()[0]["status"] == 0x40
@@ -238,7 +238,7 @@ def test_a_card_first_then_the_key() -> None:
         assert client.ask("rd")[16:21] == bytes((1, 0, 5, 0, 77))
 
 
-def test_an_unknown_card_asks_the_server() -> None:
+def test_an_unknown_card_requests_a_start_from_the_server() -> None:
     car = Car()
     box = EwsBox(cars=(car,), rfid=True)
     with line_to(box) as (bus, client):

@@ -1,4 +1,4 @@
-"""A charging port in its own time: what leads from one status to the next."""
+"""A charging port in its own time: its status and transitions."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_locked_before_there_is_voltage(bench: Bench) -> None:
     assert bench.port.contactor
 
 
-def test_a_car_that_is_not_ready_makes_a_pause(bench: Bench) -> None:
+def test_a_car_that_is_not_ready_is_a_pause(bench: Bench) -> None:
     bench.charging()
     bench.car.finish()
     assert bench.live() == Status.PAUSE
@@ -119,7 +119,7 @@ def test_the_second_six_unlocks(bench: Bench, shown: int) -> None:
     assert bench.sl(3) == Code.ENDED
 
 
-def test_a_resumed_charge_counts_on(bench: Bench) -> None:
+def test_a_resumed_charge_keeps_its_counters(bench: Bench) -> None:
     bench.charging()
     bench.sl(6)
     before = bench.port.session.wh
@@ -131,7 +131,7 @@ def test_a_resumed_charge_counts_on(bench: Bench) -> None:
     assert bench.port.session.cycles == 1
 
 
-def test_unlocking_is_overtaken_by_a_start(bench: Bench) -> None:
+def test_a_start_reverses_an_unlocking(bench: Bench) -> None:
     bench.car.plug_in()
     bench.live()
     bench.sl(7)
@@ -143,7 +143,7 @@ def test_unlocking_is_overtaken_by_a_start(bench: Bench) -> None:
 
 
 def test_lock_first_start_later(bench: Bench) -> None:
-    """What 3.1.8 lets a server do while there is too little current."""
+    """The way of 3.1.8 to wait for enough current."""
     assert bench.sl(7) == Code.LOCK
     bench.car.plug_in()
     bench.live()
@@ -156,7 +156,7 @@ def test_lock_first_start_later(bench: Bench) -> None:
     assert bench.live() == Status.CHARGING
 
 
-def test_a_start_without_a_car_arms_the_next_one(bench: Bench) -> None:
+def test_a_start_without_a_car_is_for_the_next_one(bench: Bench) -> None:
     assert bench.sl(3) == Code.OK
     assert bench.port.start_mode == 2
     bench.live()
@@ -164,7 +164,7 @@ def test_a_start_without_a_car_arms_the_next_one(bench: Bench) -> None:
     assert bench.live() == Status.CHARGING
 
 
-def test_a_request_goes_with_the_car(bench: Bench) -> None:
+def test_a_request_ends_when_the_car_leaves(bench: Bench) -> None:
     bench.car.plug_in()
     bench.live()
     assert bench.sl(2) == Code.OK
@@ -186,7 +186,7 @@ def test_pulled_at_the_car(bench: Bench) -> None:
     assert not bench.port.unlocked_while_car_wants
 
 
-def test_a_pause_of_the_servers_ends_with_the_car(bench: Bench) -> None:
+def test_a_pause_by_the_server_ends_when_the_car_leaves(bench: Bench) -> None:
     bench.charging()
     bench.sl(6)
     bench.live()
@@ -290,7 +290,7 @@ def test_cables(bench: Bench, cable: int | None, must_match: bool, status: int) 
     assert bench.sl(3) == (Code.CABLE if status == Status.CABLE_ERROR else Code.OK)
 
 
-def test_what_is_offered_is_the_least_of_all(bench: Bench) -> None:
+def test_the_offer_is_the_lowest_of_all_limits(bench: Bench) -> None:
     port = bench.port
     assert port.offered == 32
     port.installation.limit = 25
@@ -321,7 +321,7 @@ def test_ventilation(bench: Bench) -> None:
     bench.charging()
 
 
-def test_a_car_that_cannot_decide(bench: Bench) -> None:
+def test_an_unstable_pilot(bench: Bench) -> None:
     bench.charging()
     for _ in range(4):
         bench.car.requesting = False

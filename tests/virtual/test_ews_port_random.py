@@ -1,4 +1,4 @@
-"""Whatever is ordered, pulled, tripped or jammed: what can never be."""
+"""Invariants of a port under any sequence of orders, events and defects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The status blocks byte by byte, in the order of the manual's tables."""
+"""The status blocks byte by byte, in the order of the tables in the manual."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from .car import Car
 from .ews_box import EwsBox
 from .ews_rfid import Card
 
-# The parts of one port in `rc`, each as wide as the manual says: 54 bytes.
+# The fields of one port in `rc`, with the widths of the manual: 54 bytes.
 CHARGING = """
 41 14 0D 01 02 01 00
 0000000A 0000000B 0000000C 0000000D 0000000E 0000000F

@@ -1,4 +1,4 @@
-"""Faults, once and by rates."""
+"""Faults, once and by rate."""
 
 from __future__ import annotations
 

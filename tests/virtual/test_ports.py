@@ -1,4 +1,4 @@
-"""The client's end: opening again, pulling the adapter, one client at a time."""
+"""The client's end: reopening, unplugging the adapter, one client at a time."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_pty_opens_again_and_again(parity: str) -> None:
         assert bus.opened >= 1
 
 
-def test_what_a_client_did_not_read_is_gone() -> None:
+def test_unread_bytes_are_dropped_on_close() -> None:
     box = AblBox(1)
     with VirtualBus.pty(box) as bus:
         with RawClient(bus.url, "E") as client:
@@ -37,7 +37,7 @@ def test_what_a_client_did_not_read_is_gone() -> None:
             assert client.read(1, 0.05) == b""
 
 
-def test_what_a_hasty_client_wrote_is_not_lost() -> None:
+def test_bytes_of_a_client_that_closes_at_once_are_not_lost() -> None:
     box = AblBox(1)
     with VirtualBus.pty(box) as bus:
         with RawClient(bus.url, "E") as client:
@@ -87,7 +87,7 @@ def test_tcp_has_one_client_at_a_time() -> None:
             assert third.ask(READ_FULL) == ANSWER
 
 
-def test_link_of_ones_own(tmp_path: Path) -> None:
+def test_a_given_link(tmp_path: Path) -> None:
     link = tmp_path / "ttyABL"
     with VirtualBus.pty(AblBox(1), link=str(link)) as bus:
         assert bus.url == str(link)

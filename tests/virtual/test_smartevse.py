@@ -46,7 +46,7 @@ def charging(
     return alone
 
 
-def test_a_car_comes_charges_and_goes() -> None:
+def test_a_car_comes_charges_and_leaves() -> None:
     car = Car(max_current=16)
     alone = SmartEvseAlone("2.17", car)
     alone.live(2)
@@ -69,12 +69,12 @@ def test_a_car_comes_charges_and_goes() -> None:
     alone.live(0.1)
     assert alone.state == "A"
     assert alone.outlet.car_current == 0.0
-    # The cable stays as it was measured.
+    # The measured cable current is kept.
     assert alone.read(0xA2) == [16]
 
 
 def test_pilot_without_pwm() -> None:
-    """A real car stops asking at once when the PWM stops; an odd one does not."""
+    """A real car ends its request when the PWM stops; a defective one does not."""
     for odd in (False, True):
         alone = charging(car=Car(asks_without_pwm=odd))
         assert alone.write(0xA7, 0) == "ok"
@@ -88,13 +88,13 @@ def test_pilot_without_pwm() -> None:
 
 @pytest.mark.parametrize("function", [6, 16])
 def test_override(function: int) -> None:
-    """Refused by the answer, and taken within two seconds."""
+    """The reply is a refusal, but it takes effect within two seconds."""
     alone = charging()
     assert alone.write(0xA6, 80, function=function) == "refused 3"
     alone.live(2.1)
     assert alone.read(0xA6) == [80]
     assert alone.outlet.pilot_current == 8.0
-    # Above the cable's and its own maximum.
+    # Above the maximum of the cable and of the box.
     alone.write(0xA6, 250)
     alone.live(2.1)
     assert alone.outlet.pilot_current == 25.0
@@ -110,7 +110,7 @@ def test_override(function: int) -> None:
     assert alone.outlet.contactor
 
 
-def test_override_waits_for_the_car_and_dies_with_the_power() -> None:
+def test_override_waits_for_the_car_and_is_lost_with_the_power() -> None:
     car = Car()
     alone = SmartEvseAlone("2.17", car)
     alone.write(0xA6, 80)
@@ -168,12 +168,12 @@ def test_every_second_single_write_is_dropped() -> None:
     assert results == ["ok", "silence", "ok", "silence"]
     assert alone.read(0xA7) == [0]
     assert alone.box.dropped == 2
-    # A read between, another function, or another unit's request make it a request.
+    # After a read, another function or a request to another unit it is a request.
     for between in (read_frame(0, 0xA0, 1), read_frame(7, 0, 1), write_frame(9, 1, 1)):
         assert alone.write(0xA7, 1, function=6) == "ok"
         alone.hear(between)
     assert [alone.write(0xA7, 1) for _ in range(3)] == ["ok"] * 3
-    # What it does not understand changes nothing.
+    # Unknown frames change nothing.
     alone.hear(read_frame(0, 0xA0, 1))
     alone.write(0xA7, 1, function=6)
     alone.hear(read_frame(0, 0xA0, 1, function=3))
@@ -184,7 +184,7 @@ def test_unit_is_the_load_balance_setting() -> None:
     alone = SmartEvseAlone("2.17", load_balance=3)
     assert alone.hear(read_frame(0, 0xA0, 9)) is None
     assert alone.hear(read_frame(3, 0xA0, 9))
-    # Written for everybody: taken, not answered.
+    # A broadcast write is accepted, without a reply.
     assert alone.hear(write_several_frame(0, 0xA7, 0)) is None
     assert not alone.outlet.access
     assert alone.hear(write_several_frame(2, 0xA7, 1)) is None
@@ -192,7 +192,7 @@ def test_unit_is_the_load_balance_setting() -> None:
 
 
 def test_volatile_mode() -> None:
-    """Vanishes unless balancing is on and the mode is not normal."""
+    """Ignored unless balancing is on and the mode is not normal."""
     for load_balance, mode, works in ((0, 1, False), (1, 0, False), (1, 1, True)):
         alone = SmartEvseAlone("2.17", load_balance=load_balance, mode=mode)
         assert alone.read(0xA8) == ([mode] if works else [])
@@ -212,7 +212,7 @@ def test_refusals() -> None:
     assert alone.write(0xA9, 1) == "refused 2"
     assert alone.hear(read_frame(0, 0xA8, 2)) is None
     assert alone.hear(read_frame(0, 0xA7, 3)) == frame(0, 4, b"\x02")
-    # Of two registers one is taken: it says so by the count.
+    # Of two values one is accepted; the reply has that count.
     answer = alone.hear(write_several_frame(0, 0xA6, 80, 0))
     assert answer == frame(0, 16, bytes.fromhex("00a60001"))
     for register in (*range(1, 5), 0x81, 0x82, 0x84):
@@ -233,7 +233,7 @@ def test_stored_settings() -> None:
 
 @pytest.mark.parametrize(("switch", "opens"), [(0, True), (1, False), (2, False)])
 def test_storing_opens_access(switch: int, opens: bool) -> None:  # noqa: FBT001
-    """With a plugged car that starts the charge."""
+    """With a plugged-in car this starts the charge."""
     car = Car()
     alone = SmartEvseAlone("2.17", car, switch=switch)
     alone.write(0xA7, 0)
@@ -293,7 +293,7 @@ def test_errors() -> None:
 
 @pytest.mark.parametrize(("mode", "bit"), [(1, 1), (2, 32)])
 def test_its_own_meter(mode: int, bit: int) -> None:
-    """Not enough: 60 s; and when there is again, it says so to everybody, unasked."""
+    """Too little current: 60 s; then it broadcasts the cleared errors."""
     alone = charging(mode=mode)
     alone.outlet.meter_leaves = 3
     alone.live(4)
@@ -322,11 +322,11 @@ def test_activation_after_thirty_seconds_in_b() -> None:
     assert alone.state == "B"
 
 
-def test_silence_makes_a_frame_on_the_wire() -> None:
+def test_silence_ends_a_frame_on_the_wire() -> None:
     box = SmartEvse()
     request = read_frame(0, 0xA0, 9)
     with line_to(box) as (bus, client):
-        # Two requests without a gap are one piece of nonsense, and so is a torn one.
+        # Two requests without a gap are one bad frame, and so is one with a gap.
         client.write(request + request)
         assert client.read(1, SILENT) == b""
         client.write(request[:4])
@@ -345,7 +345,7 @@ def test_silence_makes_a_frame_on_the_wire() -> None:
         assert [r.register for r in smartevse_requests_in(bus)] == [0xA0]
 
 
-def test_answers_wait_for_silence() -> None:
+def test_replies_wait_for_silence() -> None:
     box = SmartEvse(turn_round=0.0)
     with line_to(box) as (bus, client):
         client.write(read_frame(0, 0xA0, 1))
@@ -370,7 +370,7 @@ def test_defects() -> None:
         box.set_at_the_box("max_current", 5)
 
 
-def test_witness() -> None:
+def test_requests_in_the_log() -> None:
     box = SmartEvse(load_balance=2)
     with line_to(box) as (bus, client):
         client.write(write_several_frame(0, 1, 0, 60, 0, 0))

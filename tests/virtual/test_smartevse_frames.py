@@ -36,7 +36,7 @@ def test_frames_as_recorded() -> None:
 
 
 @given(unit=BYTE, register=WORD, values=st.lists(WORD, min_size=1, max_size=20))
-def test_writes_come_back(unit: int, register: int, values: list[int]) -> None:
+def test_writes_are_decoded(unit: int, register: int, values: list[int]) -> None:
     one = decode(write_frame(unit, register, values[0]), V2_17.functions)
     assert one is not None
     assert (one.kind, one.unit, one.register) == ("either", unit, register)
@@ -48,7 +48,7 @@ def test_writes_come_back(unit: int, register: int, values: list[int]) -> None:
 
 
 @given(st.binary(max_size=60))
-def test_anything_is_taken_apart_or_refused(data: bytes) -> None:
+def test_any_bytes_are_decoded_or_ignored(data: bytes) -> None:
     assert decode(data, V2_17.functions) is None or crc16(data[:-2]) == data[-2:]
     for function in (READ_INPUT, WRITE_ONE, WRITE_SEVERAL):
         packet = decode(frame(1, function, data), V2_17.functions)
@@ -67,11 +67,11 @@ def test_anything_is_taken_apart_or_refused(data: bytes) -> None:
         read_frame(0, 0xA0, 9)[:-1] + b"\x00",
     ],
 )
-def test_what_a_217_makes_nothing_of(data: bytes) -> None:
+def test_frames_that_a_217_ignores(data: bytes) -> None:
     assert decode(data, V2_17.functions) is None
 
 
-def test_answers_are_no_requests() -> None:
+def test_replies_are_no_requests() -> None:
     answers = (values_frame(2, 4, [0] * 9), frame(2, 16, bytes.fromhex("00a70001")))
     for data in answers:
         packet = decode(data, V2_17.functions)
@@ -83,7 +83,7 @@ def test_answers_are_no_requests() -> None:
 
 @pytest.mark.parametrize("dialect", DIALECTS.values(), ids=lambda d: d.name)
 def test_tables(dialect: Dialect) -> None:
-    """Every item once, defaults in range, and found where it is said to be."""
+    """Every item once, with a default in its range, at its register."""
     names = [
         item.name if isinstance(item, Setting) else item
         for block in dialect.blocks
@@ -94,7 +94,7 @@ def test_tables(dialect: Dialect) -> None:
         found = dialect.find(dialect.register_of(name), 1)
         assert found is not None
     for setting in dialect.settings.values():
-        # A meter is none in the mode normal, although none cannot be chosen.
+        # In mode normal the meter is 0, although 0 cannot be set.
         assert setting.low <= setting.default <= setting.high or setting.default == 0
     with pytest.raises(KeyError):
         dialect.register_of("nothing")

@@ -1,4 +1,4 @@
-"""The virtual SmartEVSE of the later dialects: gentle stops, and foreign masters."""
+"""The virtual SmartEVSE of the later dialects: gentle stops, and other masters."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_status_of_later(function: int) -> None:
 def test_writes(dialect: str, current: int, access: int) -> None:
     alone = charging(dialect)
     assert alone.write(current, 80) == "ok"
-    # Nothing is refused that is not stored.
+    # Volatile registers are never refused.
     assert alone.write(access, 7, function=6) == "ok"
     assert alone.outlet.access
     assert alone.write(current, 90, function=6) == "silence"
@@ -65,7 +65,7 @@ def test_access_of_220_is_state_a() -> None:
 
 
 def test_access_stops_gently() -> None:
-    """The PWM first, the contactor when the car has stopped; then B1: plugged."""
+    """First the PWM, then, once the car has stopped, the contactor; then B1."""
     alone = charging()
     assert alone.write(5, 0) == "ok"
     assert (alone.state, alone.outlet.contactor) == ("C1", True)
@@ -96,7 +96,7 @@ def test_volatile_mode_is_answered_and_ignored() -> None:
 
 
 def test_polling_all_the_time_ends_in_no_comm() -> None:
-    """Its own cycle does not run while it hears requests, whoever is asked."""
+    """Its own cycle does not run while there are requests, to any address."""
     alone = charging()
     for _ in range(6):
         alone.hear(read_frame(77, 0, 1))
@@ -104,14 +104,14 @@ def test_polling_all_the_time_ends_in_no_comm() -> None:
     alone.live(0.5)
     assert alone.outlet.error == NO_COMM
     assert alone.state == "C1"
-    # It heals by itself, when it is quiet.
+    # It recovers by itself after some silence.
     alone.live(6.2)
     assert alone.outlet.error == 0
     alone.live(25)
     assert alone.state == "C"
 
 
-def test_bursts_with_six_seconds_of_quiet_keep_it_well() -> None:
+def test_bursts_with_six_seconds_of_silence_do_no_harm() -> None:
     alone = charging()
     for _ in range(30):
         for _ in range(4):
@@ -160,8 +160,8 @@ def test_stored_settings() -> None:
 @pytest.mark.parametrize(
     ("dialect", "register", "after"), [("2.20", 1, "A"), ("later", 0x20, "C1")]
 )
-def test_slaves_hear_unit_9(dialect: str, register: int, after: str) -> None:
-    """They wait to be read, and a broadcast of 0 is a stop."""
+def test_slaves_follow_unit_9(dialect: str, register: int, after: str) -> None:
+    """They wait to be polled, and a broadcast of 0 is a stop."""
     car = Car()
     alone = SmartEvseAlone(dialect, car, load_balance=2)
     state = 0xA0 if dialect == "2.20" else 0

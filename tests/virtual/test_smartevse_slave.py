@@ -22,7 +22,7 @@ ACK_A, ACK_B, ACK_C, ACK_CB = range(0x81, 0x85)
 
 
 class Slave(SmartEvseAlone):
-    """Slave 2 and somebody who plays its master."""
+    """Slave 2, and frames of its master."""
 
     def __init__(self, car: Car | None = None, **settings: int) -> None:
         super().__init__("2.17", car or Car(), load_balance=2, **settings)
@@ -50,7 +50,7 @@ class Slave(SmartEvseAlone):
         assert self.hear(write_frame(2, register, value)) is None
 
     def charge(self) -> None:
-        """Bring it to charge with 6 A."""
+        """Start a charge of 6 A."""
         self.car.plug_in()
         self.mastered(0.5)
         self.acknowledge(ACK_B)
@@ -63,7 +63,7 @@ class Slave(SmartEvseAlone):
         return [(r.register, r.value) for r in self.box.requests_sent]
 
 
-def test_it_asks_every_second_until_answered() -> None:
+def test_it_repeats_its_request_every_second_until_acknowledged() -> None:
     slave = Slave(max_current=32, cable=13)
     slave.car.plug_in()
     slave.mastered(3.5)
@@ -111,8 +111,8 @@ def test_a_car_that_is_full_and_one_that_leaves() -> None:
 
 
 @pytest.mark.parametrize("stage", [ACK_B, ACK_C])
-def test_answered_with_no_current(stage: int) -> None:
-    """A minute in A; then it asks again."""
+def test_acknowledged_with_no_current(stage: int) -> None:
+    """A minute in A; then it sends its request again."""
     slave = Slave()
     slave.car.plug_in()
     slave.mastered(0.5)
@@ -134,7 +134,7 @@ def test_answered_with_no_current(stage: int) -> None:
     ("word", "amps"), [(0, 6.0), (59, 6.0), (60, 6.0), (137, 13.7), (801, 6.0)]
 )
 def test_a_broadcast_is_never_a_stop(word: int, amps: float) -> None:
-    """Nor does the box hold its own maximum of 13 A against it."""
+    """Nor does the box limit it to its own maximum of 13 A."""
     slave = Slave()
     slave.charge()
     slave.mastered(4)
@@ -153,7 +153,7 @@ def test_without_broadcasts_it_stops() -> None:
     slave.broadcast()
     slave.live(9.8)
     assert (slave.state, slave.outlet.contactor) == ("C", True)
-    # Being read or written to is no broadcast.
+    # A read or a write is no broadcast.
     slave.read(0xA0, 9)
     slave.live(1.2)
     assert (slave.state, slave.outlet.contactor) == ("A", False)
@@ -190,7 +190,7 @@ def test_access_off_stops_one_slave() -> None:
     assert slave.asked()[0] == (0x02, 130)
 
 
-def test_after_access_a_car_must_have_let_go() -> None:
+def test_after_access_a_car_must_have_ended_its_request() -> None:
     slave = Slave(Car(asks_without_pwm=True))
     slave.charge()
     slave.write(0xA7, 0)
@@ -204,7 +204,7 @@ def test_after_access_a_car_must_have_let_go() -> None:
 
 
 def test_a_late_acknowledgement_starts_a_stopped_car() -> None:
-    """0x83 closes the contactor in whatever state, also without access."""
+    """0x83 closes the contactor in any state, also without access."""
     slave = Slave(Car(asks_without_pwm=True))
     slave.charge()
     slave.write(0xA7, 0)
@@ -233,7 +233,7 @@ def test_error_broadcast_stops_for_a_minute() -> None:
     assert slave.outlet.error == LESS_6A
     slave.mastered(6)
     assert slave.outlet.error == 0
-    # A master that clears its errors clears the slave's.
+    # A master that clears its errors clears those of the slave.
     slave.charge()
     slave.hear(write_frame(0, 2, 0x20))
     slave.hear(write_frame(0, 2, 0))
@@ -241,12 +241,12 @@ def test_error_broadcast_stops_for_a_minute() -> None:
     assert slave.state == "A"
 
 
-def test_acknowledgements_are_no_answers_and_writes_after_them_are() -> None:
-    """Its own request counts as what was heard last: 82 undoes that."""
+def test_acknowledgements_are_no_replies_and_writes_after_them_are() -> None:
+    """Its own request counts as the last one: 82 undoes that."""
     slave = Slave()
     slave.car.plug_in()
     slave.live(0.5)
-    # Its request was 06 to unit 2: the next 06 to it is taken for the answer.
+    # Its request was 06 to unit 2: the next 06 to it counts as the reply.
     assert slave.write(0xA7, 0, function=6) == "silence"
     assert slave.outlet.access
     slave.live(1.2)
@@ -255,12 +255,12 @@ def test_acknowledgements_are_no_answers_and_writes_after_them_are() -> None:
     assert slave.write(0xA7, 0, function=6) == "ok"
     assert not slave.outlet.access
     assert slave.write(0xA7, 1, function=6) == "silence"
-    # An 82 between makes the memory neither better nor worse.
+    # An 82 between has no effect on that.
     slave.acknowledge(ACK_B)
     assert slave.write(0xA7, 1, function=6) == "silence"
 
 
-def test_broadcasts_that_are_none() -> None:
+def test_frames_that_are_no_broadcasts() -> None:
     slave = Slave()
     slave.charge()
     for other in (
@@ -274,7 +274,7 @@ def test_broadcasts_that_are_none() -> None:
         assert slave.read(0xA6) == [60]
 
 
-def test_master_says_currents_and_acknowledges() -> None:
+def test_a_master_broadcasts_and_acknowledges() -> None:
     car = Car()
     master = SmartEvseAlone("2.17", car, load_balance=1, circuit=20)
     master.live(6)
@@ -294,7 +294,7 @@ def test_master_says_currents_and_acknowledges() -> None:
     assert master.sent[-1][1] == write_several_frame(0, 1, 100, 100, 0, 0)
     assert ask(3, 0x02) == 60
     assert ask(3, 0x03, 60) == 60
-    # Four times 6 A are more than the circuit has.
+    # Four times 6 A are above the limit of the circuit.
     assert ask(4, 0x02) == 0
     assert ask(2, 0x04) == 0
     master.live(2)
@@ -318,14 +318,14 @@ def test_two_slaves_and_their_master_on_the_wire() -> None:
         gaps = [b.t - a.t for a, b in itertools.pairwise(broadcasts)]
         assert all(1.5 < gap < 2.5 for gap in gaps)
         assert smartevse_requests_in(bus) == []
-        # A dead master: his slaves stop by themselves.
+        # A dead master: its slaves stop by themselves.
         master.faults.dead = True
         bus.advance(12)
         assert [slave.error for slave in slaves] == [NO_COMM] * 2
         assert not any(slave.contactor for slave in slaves)
 
 
-def test_a_foreign_master_of_a_later_dialect() -> None:
+def test_another_master_of_a_later_dialect() -> None:
     with VirtualBus.pty(SmartEvse("later", load_balance=1)) as bus:
         bus.advance(2)
         bus.wait_for(lambda: len(bus.log) > 0)
@@ -333,7 +333,7 @@ def test_a_foreign_master_of_a_later_dialect() -> None:
         assert (heard.unit, heard.register, heard.count) == (9, 0x20, 8)
 
 
-def test_a_reading_of_another_unit_is_not_for_it() -> None:
+def test_a_read_of_another_unit_is_ignored() -> None:
     slave = Slave()
     assert slave.hear(read_frame(3, 0xA0, 9)) is None
     assert slave.hear(read_frame(2, 0xA0, 9))

@@ -1,7 +1,7 @@
 """The virtual SmartEVSE against bytes recorded from the maker's v2.17 firmware.
 
-The recorder's times between the exchanges are not all in the trace; what it did
-meanwhile is said here, beside the words it wrote down.
+The trace does not have all times between the exchanges; the events meanwhile are listed
+here by the names in the trace.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ TRACE: dict[str, list[dict[str, Any]]] = json.loads(
 )
 EXCHANGE = 0.25
 
-# What was done at the outlet before an exchange: pilot in V (None: as it was), wait in
-# s of the box. Exchanges that are not named followed at once.
+# Events before an exchange: voltage of the pilot (None: unchanged), wait in seconds of
+# the box. Other exchanges followed at once.
 BEFORE_NORMAL: dict[str, tuple[int | None, float]] = {
     "car plugged in (pilot 9 V): state B": (9, 1.0),
     "car asks for power (pilot 6 V): state C": (6, 1.0),
@@ -35,7 +35,7 @@ BEFORE_NORMAL: dict[str, tuple[int | None, float]] = {
     "3 s later": (None, 3.0),
     "car unplugged (pilot 12 V): state A": (12, 1.0),
 }
-# How long the recorder listened.
+# Duration of each recording without requests, s.
 LISTENED = {
     "load balancing master (C1=1), nobody asks: what it sends by itself": 7.5,
     "load balancing slave (C1=2), nobody asks: what it sends by itself": 3.0,
@@ -68,14 +68,14 @@ class Recording(SmartEvseAlone):
         return [(t, data.hex()) for t, data in self.sent]
 
     def heard_alone(self, seconds: float) -> list[tuple[float, str]]:
-        """Listen; return what it sent, with times from the beginning."""
+        """Return the frames sent within a time, with times from its beginning."""
         begin, before = self.now, len(self.sent)
         self.live(seconds)
         return [(t - begin, frame) for t, frame in self.sent_hex[before:]]
 
 
 def frames_of(lumps: list[tuple[float, str]]) -> list[tuple[float, str]]:
-    """Join what the recorder read in two pieces at one moment."""
+    """Join frames that the recorder read in two pieces at one moment."""
     frames: list[tuple[float, str]] = []
     for t, data in lumps:
         if frames and frames[-1][0] == t:
@@ -88,7 +88,7 @@ def frames_of(lumps: list[tuple[float, str]]) -> list[tuple[float, str]]:
 def assert_alike(
     got: list[tuple[float, str]], want: list[tuple[float, str]], within: float
 ) -> None:
-    """Hold frames to the trace's: the bytes, and the times between them."""
+    """Compare frames with the trace: the bytes, and the times between them."""
     assert [frame for _, frame in got] == [frame for _, frame in want]
     for index in range(1, len(want)):
         period = want[index][0] - want[index - 1][0]
@@ -96,7 +96,7 @@ def assert_alike(
 
 
 def replay(record: Recording, entries: list[dict[str, Any]]) -> Iterator[str]:
-    """Replay requests and listening; yield what was done."""
+    """Replay the trace; yield each of its entries."""
     for entry in entries:
         what = entry["what"]
         if "unsolicited" in entry:
@@ -126,7 +126,7 @@ def test_master() -> None:
 
 
 def test_slave() -> None:
-    """Also how the acknowledged slave got to state A: nobody broadcast for 10 s."""
+    """The acknowledged slave also went to state A: no broadcast for 10 s."""
     record = Recording(2)
     out = record.outlet
     seen: dict[str, list[tuple[str, bool, int]]] = {}
@@ -139,7 +139,7 @@ def test_slave() -> None:
 
 
 def test_slave_with_master() -> None:
-    """The whole minute by the clock, with all the master said."""
+    """The whole minute by the clock, with all frames of the master."""
     record = Recording(2)
     pilots = {"plug ": 9, "power ": 6, "unplug ": 12}
     answers: list[tuple[float, str]] = []
@@ -157,12 +157,12 @@ def test_slave_with_master() -> None:
     want = [(e["t"], e["hex"]) for e in sections if e.get("dir") == "slave"]
     assert [frame for _, frame in got] == [frame for _, frame in want]
     for (t, _), (recorded, _) in zip(got, want, strict=True):
-        # The recorder gave every answer a quarter of a second.
+        # The recorder waited a quarter of a second for every reply.
         assert recorded - 0.32 <= t <= recorded + 0.05
     assert len(record.sent) == 2
 
 
-# Pilot, what the master broadcasts (0.1 A; None: as before), and how long.
+# Pilot, broadcast of the master (0.1 A; None: as before), and duration.
 BEFORE_RESUME: dict[str, tuple[int | None, int | None, float]] = {
     "state A": (None, None, 1.0),
     "plugged": (9, None, 0.3),
@@ -213,7 +213,7 @@ def test_slave_stop_and_resume() -> None:
 
 
 def test_normal_on_the_wire() -> None:
-    """The same bytes through the port, at the line's pace."""
+    """The same bytes through the port, at the pace of the line."""
     box = SmartEvse()
     box.outlet.pilot_voltage = 12
     with VirtualBus.pty(box) as bus, RawClient(bus.url, "N", termios.B9600) as client:
