@@ -148,7 +148,7 @@ async def test_a_start_request_of_another_card_is_not(hass: HomeAssistant) -> No
             await wait_for_state(hass, requested, "on")
             await wait_for_state(hass, requested, "off")
         await bus.wait_for_async(lambda: box.ports[0].start_mode == 0)
-        assert not box.ports[0].witness.starts
+        assert not box.ports[0].history.starts
         assert [one.parameters for one in box.commands_named("sl")] == [b"\x01\x01"]
 
 
@@ -173,4 +173,4 @@ async def test_a_card_of_another_format_is_accepted(
         if starts:
             await bus.wait_for_async(lambda: box.ports[0].contactor)
         else:
-            assert not box.ports[0].witness.starts
+            assert not box.ports[0].history.starts

@@ -141,7 +141,7 @@ async def test_buses_are_added_once_and_all_is_on_the_dashboard(
         for bus, box, number in ((serial, workshop, 1), (dialler, loading_bay, 2)):
             port = box.ports[number - 1]
             await bus.wait_for_async(lambda port=port: port.status == 0x30, 15)
-            assert not port.witness.starts
+            assert not port.history.starts
             box.press_key(number, 1)
             await bus.wait_for_async(lambda port=port: port.status == 0x40, 15)
 

@@ -56,7 +56,7 @@ async def test_a_pause_is_said_once_and_keeps_the_cable_locked(
         await wait_for_state(hass, status, "charging")
         assert state_of(hass, switch) == "on"
         assert port.session.cycles == 1
-        assert not port.witness.unlockings
+        assert not port.history.unlockings
 
 
 async def test_off_twice_at_once(hass: HomeAssistant) -> None:
@@ -71,7 +71,7 @@ async def test_off_twice_at_once(hass: HomeAssistant) -> None:
         await polled(bus, box, 20)
         assert orders(box) == [START, PAUSE]
         assert box.ports[0].locked
-        assert not box.ports[0].witness.unlockings
+        assert not box.ports[0].history.unlockings
 
 
 async def test_a_stop_outruns_a_start(hass: HomeAssistant) -> None:
@@ -120,12 +120,12 @@ async def test_a_lost_answer_to_the_pause_unlocks_nobody(
         await stopping
         assert not port.contactor
         assert port.locked
-        assert not port.witness.unlockings
+        assert not port.history.unlockings
         assert orders(box) == [START, *[PAUSE] * (1 if reaches else 2)]
         await wait_for_state(hass, switch, "off")
         await polled(bus, box, 20)
         assert len(orders(box)) == (2 if reaches else 3)
-        assert not port.witness.unlockings
+        assert not port.history.unlockings
 
 
 async def test_a_slider_moved_while_paused_starts_nobody(hass: HomeAssistant) -> None:
@@ -186,7 +186,7 @@ async def test_a_charge_that_begins_against_a_pause_is_paused(
         await call(hass, "switch.turn_off", switch)
         await plug_in(bus, box)
         box.start_on_web_page(1)
-        await bus.wait_for_async(lambda: port.witness.starts)
+        await bus.wait_for_async(lambda: port.history.starts)
         await bus.wait_for_async(lambda: PAUSE in orders(box))
         await wait_for_state(hass, switch, "off")
         assert not port.contactor
@@ -220,7 +220,7 @@ async def test_orders_that_nobody_renews_pause_and_go_on(hass: HomeAssistant) ->
         await bus.wait_for_async(lambda: port.contactor, timeout=10)
         assert orders(box) == [START, PAUSE, START]
         assert port.limit == 9
-        assert not port.witness.unlockings
+        assert not port.history.unlockings
         assert 0 not in limits(box)
 
 

@@ -93,7 +93,7 @@ async def test_unlocking_while_charging_stops(hass: HomeAssistant) -> None:
         assert orders(box) == [START, STOP]
         assert not port.locked
         assert not port.contactor
-        assert not port.witness.unlocked_under_power
+        assert not port.history.unlocked_under_power
 
 
 async def test_locking_an_empty_socket_is_refused(hass: HomeAssistant) -> None:

@@ -82,7 +82,7 @@ async def test_a_crash_in_the_middle_of_a_pause(
         await polled(bus, box, 10)
         assert orders(box) == [START, PAUSE]
         assert port.locked
-        assert not port.witness.unlockings
+        assert not port.history.unlockings
         assert not port.contactor
         # The user's word lets it go on.
         await call(hass, "switch.turn_on", switch)

@@ -22,7 +22,7 @@ from .bus import VirtualBus
 from .car import Car, CarLife
 from .device import Device
 from .evbox import EvboxChargePoint, Module
-from .evbox_frames import Order, orders_in, rude_requests
+from .evbox_frames import Order, orders_in, requests_without_silence
 from .ews_box import EwsBox
 from .ews_dialler import EwsDialler
 from .ews_frames import ews_commands_in
@@ -71,6 +71,6 @@ __all__ = [
     "ews_commands_in",
     "orders_in",
     "requests_in",
-    "rude_requests",
+    "requests_without_silence",
     "smartevse_requests_in",
 ]

@@ -169,9 +169,9 @@ class AblBox(Device):
         self.outlet.clear_failure()
 
     @on_bus_thread
-    def set_by_somebody(self, amps: float) -> None:
+    def set_by_other_master(self, amps: float) -> None:
         """Set Icmax as another master would."""
-        self.outlet.set_by_somebody(amps)
+        self.outlet.set_by_other_master(amps)
 
     def stats(self) -> dict[str, object]:
         """Return the counters."""
@@ -197,7 +197,7 @@ class AblBox(Device):
             self.outlet.contact(now)
         self.outlet.step(now)
 
-    def hear(self, segment: Segment) -> None:
+    def receive(self, segment: Segment) -> None:
         """Receive bytes; reply to a request addressed to this box."""
         if segment.end <= self._deaf_until:
             return
@@ -293,7 +293,7 @@ class AblBox(Device):
             # The reset begins after the reply.
             self._schedule_reset()
             return True
-        return self.outlet.obey(value)
+        return self.outlet.execute(value)
 
     def _schedule_reset(self) -> None:
         if self.bus is None:

@@ -149,7 +149,7 @@ class Outlet:
         if self.state.startswith("F"):
             self.go("A1")
 
-    def set_by_somebody(self, amps: float) -> None:
+    def set_by_other_master(self, amps: float) -> None:
         """Set Icmax as another master would (A; 0 = no current allowed)."""
         self.icmax = duty_of(amps)
 
@@ -160,7 +160,7 @@ class Outlet:
             self._since = self._now
             self._recovers_at = None
 
-    def obey(self, value: int) -> bool:
+    def execute(self, value: int) -> bool:
         """Execute a value of register 0x05 (not the reset); False: not in this state."""
         allowed = {
             # The manual requires no state for E0; in a failure, E0 would hide it.

@@ -395,7 +395,7 @@ class VirtualBus(LoopThread):
                 if device.name in segment.sources or device.faults.dead:
                     continue
                 if not self.faults.dead:
-                    device.hear(segment)
+                    device.receive(segment)
         self.check_waiters()
 
     def _logged(self, entry: Entry) -> None:

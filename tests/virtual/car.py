@@ -57,7 +57,7 @@ class Car:
 
     It follows a changed offer after `reaction` seconds, at `max_current` per `ramp`
     seconds. Below its minimum it stops. `greedy`: factor by which it draws more than
-    offered (1.1 = 10 % too much). `wanted_wh` = None: never full. `asks_without_pwm`:
+    offered (1.1 = 10 % too much). `wanted_wh` = None: never full. `requests_without_pwm`:
     requests (6 V) even when the PWM has stopped; a real car does not.
     The methods may be called from any thread at any time.
     """
@@ -74,7 +74,7 @@ class Car:
         wanted_wh: float | None = None,
         cos_phi: float = 0.98,
         greedy: float = 1.0,
-        asks_without_pwm: bool = False,
+        requests_without_pwm: bool = False,
         life: CarLife | None = None,
     ) -> None:
         """Make a car that is away."""
@@ -87,7 +87,7 @@ class Car:
         self.wanted_wh = wanted_wh
         self.cos_phi = cos_phi
         self.greedy = greedy
-        self.asks_without_pwm = asks_without_pwm
+        self.requests_without_pwm = requests_without_pwm
         self.life = life
         self.plugged = False
         self.requesting = False

@@ -90,7 +90,7 @@ class Control:
         elif word == "start":
             device.start_locally()
         elif word == "others":
-            device.set_by_somebody(float(values[0]))
+            device.set_by_other_master(float(values[0]))
         else:
             msg = f"no such command; there are: {HELP}"
             raise ValueError(msg)
@@ -103,7 +103,7 @@ class Control:
         elif word == "menu":
             device.set_at_the_box(values[0], int(values[1]))
         elif word == "others":
-            device.set_by_somebody(float(values[0]))
+            device.set_by_other_master(float(values[0]))
         elif word == "temperature":
             device.outlet.temperature = int(values[0])
         else:

@@ -57,7 +57,7 @@ class Device:
         """Return the device's time, s; faster than real time if scaled."""
         return self.bus.now() if self.bus is not None else 0.0
 
-    def hear(self, segment: Segment) -> None:
+    def receive(self, segment: Segment) -> None:
         """Receive bytes of another sender (on the bus thread)."""
 
     def step(self) -> None:

@@ -54,7 +54,7 @@ class Module:
 
 
 @dataclass
-class Lie:
+class Distortion:
     """An implausible reply, with valid checksums."""
 
     module: int
@@ -131,7 +131,7 @@ class EvboxChargePoint(Device):
         self.failed_back = False
         self._finder = FrameFinder()
         self._standing: _Standing | None = None
-        self._lies: list[Lie] = []
+        self._distortions: list[Distortion] = []
 
     # For tests
 
@@ -157,7 +157,7 @@ class EvboxChargePoint(Device):
         """Return the number of orders above the maximum of the connection."""
         return self.counters.over_limit_requests
 
-    def lie(
+    def distort(
         self,
         module: int = 0,
         *,
@@ -171,8 +171,8 @@ class EvboxChargePoint(Device):
 
         The energy jump (Wh) is added to the reported total, not to the meter.
         """
-        self._lies.append(
-            Lie(
+        self._distortions.append(
+            Distortion(
                 module,
                 times,
                 _three(current),
@@ -182,9 +182,9 @@ class EvboxChargePoint(Device):
             )
         )
 
-    def honest(self) -> None:
+    def undistort(self) -> None:
         """Report measured values again."""
-        self._lies.clear()
+        self._distortions.clear()
 
     @on_bus_thread
     def add_module(
@@ -215,7 +215,7 @@ class EvboxChargePoint(Device):
 
     # On the bus
 
-    def hear(self, segment: Segment) -> None:
+    def receive(self, segment: Segment) -> None:
         """Receive bytes; reply to a request addressed to this box."""
         for heard in self._finder.feed(segment):
             self._heard(heard)
@@ -292,23 +292,23 @@ class EvboxChargePoint(Device):
         for index, module in enumerate(self.modules):
             currents, cos_phis = module.measured()
             energy, voltages = module.energy_wh, module.voltages
-            for lie in self._lies:
-                if lie.module == index:
-                    currents = lie.current or currents
-                    cos_phis = lie.cos_phi or cos_phis
-                    voltages = lie.voltage or voltages
-                    energy += lie.energy_jump
+            for distortion in self._distortions:
+                if distortion.module == index:
+                    currents = distortion.current or currents
+                    cos_phis = distortion.cos_phi or cos_phis
+                    voltages = distortion.voltage or voltages
+                    energy += distortion.energy_jump
             parts.append(word(module.min_current * 10))
             parts += [word(current * 10) for current in currents]
             parts += [word(phi * 1000) for phi in cos_phis]
             parts.append(f"{int(energy) & 0xFFFFFFFF:08X}")
             if long:
                 parts += [word(voltage) for voltage in voltages]
-        for lie in tuple(self._lies):
-            if lie.times is not None:
-                lie.times -= 1
-                if lie.times <= 0:
-                    self._lies.remove(lie)
+        for distortion in tuple(self._distortions):
+            if distortion.times is not None:
+                distortion.times -= 1
+                if distortion.times <= 0:
+                    self._distortions.remove(distortion)
         return "".join(parts)
 
     def _step_modules(self, now: float) -> None:

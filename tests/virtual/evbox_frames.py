@@ -173,7 +173,9 @@ def orders_in(entries: Iterable[Entry]) -> list[Order]:
     return result
 
 
-def rude_requests(entries: Iterable[Entry], silence: float = 0.1) -> list[Entry]:
+def requests_without_silence(
+    entries: Iterable[Entry], silence: float = 0.1
+) -> list[Entry]:
     """Return the client's frames that began without the required silence before.
 
     "The module needs to verify the bus is available for at least 100 ms" (Topology).

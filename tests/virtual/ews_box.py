@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from .ews_commands import COMMANDS, WRITING
 from .ews_frames import ANSWER, COMMAND, INFO, RS232_TIMEOUT, FrameReader, frame
-from .ews_hands import EwsHands
+from .ews_interaction import EwsInteraction
 from .ews_io import UserInterface
 from .ews_parameters import (
     CableMode,
@@ -50,7 +50,7 @@ POWER_UP_CLOCK = datetime(2000, 1, 1)  # noqa: DTZ001 - the box knows no zone
 CAR_BITS = (0b100, 0b010)
 
 
-class EwsBox(EwsHands):
+class EwsBox(EwsInteraction):
     """An EWS-Box with two charging ports (`ports[0]` is car 1).
 
     - `commands`, `writes`, `currents_set`, `infos`: commands received, records sent
@@ -229,7 +229,7 @@ class EwsBox(EwsHands):
             port.step(now)
         self._tell_events()
 
-    def hear(self, segment: Segment) -> None:
+    def receive(self, segment: Segment) -> None:
         """Receive bytes; answer commands."""
         if not self.powered or segment.sources != (CLIENT,):
             return
@@ -360,7 +360,7 @@ class EwsBox(EwsHands):
         if not self.system.has(SystemMode.SERVER):
             return
         for port in self.ports:
-            started = port.witness.starts[-1][0] if port.witness.starts else 0.0
+            started = port.history.starts[-1][0] if port.history.starts else 0.0
             since = max(self._heard_at, started)
             if now - since < SERVER_TIMEOUT:
                 continue

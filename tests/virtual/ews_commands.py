@@ -7,8 +7,8 @@ import struct
 from typing import TYPE_CHECKING
 
 from . import ews_status
-from .ews_hands import ROM_SIZE
-from .ews_orders import START, Code, obey
+from .ews_interaction import ROM_SIZE
+from .ews_orders import START, Code, execute
 from .ews_parameters import LOWEST_CURRENT, OK, REFUSED
 from .ews_states import Status
 
@@ -120,7 +120,7 @@ def control(box: EwsBox, parameters: bytes) -> bytes:
         return code(Code.NO_SUCH_CAR)
     number, order = parameters
     port = box.ports[number - 1]
-    answer = obey(port, order, box.user_interface.press_start)
+    answer = execute(port, order, box.user_interface.press_start)
     if order == START and answer == Code.OK and port.session.card is None:
         # "beim Starten auf den aktuellen Ladeport uebertragen" (3.1.6).
         port.session.card = box.reader.noted if box.reader.valid else None

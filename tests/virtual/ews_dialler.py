@@ -125,9 +125,9 @@ class EwsDialler(VirtualBus):
         """Dial now."""
         self.call(self.dial_port.dial)
 
-    def bury_ghosts(self) -> None:
+    def reset_half_open(self) -> None:
         """Reset the connections that were left half-open."""
-        self.call(self.dial_port.bury_ghosts)
+        self.call(self.dial_port.reset_half_open)
 
     # One thread for many diallers
 

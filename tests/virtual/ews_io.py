@@ -148,7 +148,7 @@ class UserInterface:
         mine, shown = port.session.card, self._reader.noted
         if mine is None:
             return True
-        started_at = port.witness.starts[-1][0] if port.witness.starts else 0.0
+        started_at = port.history.starts[-1][0] if port.history.starts else 0.0
         same = shown is not None and (shown.group, shown.number) == (
             mine.group,
             mine.number,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 from .ews_lock import Contactor, LockMotor, Unlocking
 from .ews_session import Result, Session
-from .ews_states import Installation, Status, Witness
+from .ews_states import Installation, PortHistory, Status
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -32,7 +32,7 @@ class PortMachine:
         self.lock = LockMotor()
         self.relay = Contactor()
         self.session = Session()
-        self.witness = Witness()
+        self.history = PortHistory()
         self.status = Status.NOT_CONNECTED
         self.cable: int | None = 32
         self.cable_must_match = False
@@ -176,8 +176,8 @@ class PortMachine:
 
     def _unlocked(self, reason: str) -> None:
         wants = self.car is not None and self.car.plugged and self.car.requesting
-        self.witness.unlockings.append(Unlocking(self._now, reason, wants))
-        self.witness.unlocked_under_power += self.contactor
+        self.history.unlockings.append(Unlocking(self._now, reason, wants))
+        self.history.unlocked_under_power += self.contactor
 
     def _transition(self) -> None:
         status = self.status
@@ -289,7 +289,7 @@ class PortMachine:
             self.lock.drive(locked=True, now=self._now, reason="start")
 
     def _enter_charging(self) -> None:
-        self.witness.starts.append((self._now, self._cause))
+        self.history.starts.append((self._now, self._cause))
         self.session.start(resumed=self.server_paused)
         self.server_paused = False
         self._go(Status.PAUSE + self.optimised)
@@ -359,16 +359,16 @@ class PortMachine:
     def _go(self, status: int) -> None:
         if status != self.status:
             self.status = status
-            self.witness.statuses.append((self._now, status))
+            self.history.statuses.append((self._now, status))
 
     def _draw(self, now: float) -> None:
         offered = self.offered if self.contactor else None
         wh = 0.0
         if self.car is not None:
             wh = self.car.step(now, offered)
-            self.witness.highest_draw = max(
-                self.witness.highest_draw, *self.car.phase_currents
+            self.history.highest_draw = max(
+                self.history.highest_draw, *self.car.phase_currents
             )
         if self.contactor:
-            self.witness.highest_offer = max(self.witness.highest_offer, self.offered)
+            self.history.highest_offer = max(self.history.highest_offer, self.offered)
         self.session.live(now, wh, active=self.active)

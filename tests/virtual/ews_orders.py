@@ -46,7 +46,7 @@ def start_refusal(port: EwsPort) -> int:
     return REFUSES_START.get(port.status, Code.OK)
 
 
-def obey(port: EwsPort, order: int, press_start: Callable[[EwsPort], None]) -> int:
+def execute(port: EwsPort, order: int, press_start: Callable[[EwsPort], None]) -> int:
     """Execute one order of `sl` and return the answer code."""
     if not STOP <= order <= LOCK:
         return Code.NO_SUCH_ORDER

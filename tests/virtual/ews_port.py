@@ -32,7 +32,7 @@ class EwsPort(PortMachine):
     @property
     def unlocked_while_car_wants(self) -> list[Unlocking]:
         """Return the unlockings while the car was requesting charge."""
-        return [u for u in self.witness.unlockings if u.car_wanted]
+        return [u for u in self.history.unlockings if u.car_wanted]
 
     @property
     def currents(self) -> tuple[float, float, float]:

@@ -22,7 +22,7 @@ RESET = struct.pack("ii", 1, 0)
 class DialPort:
     """Dials an address until it is connected; all calls are on the bus thread.
 
-    `ghosts`: sockets of connections that were left half-open.
+    `half_open`: sockets of connections that were left half-open.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class DialPort:
         self.opened = 0
         self.attempts = 0
         self.source_port = 0
-        self.ghosts: list[socket.socket] = []
+        self.half_open: list[socket.socket] = []
         self._socket: socket.socket | None = None
         self._connected = False
         self._out = bytearray()
@@ -87,7 +87,7 @@ class DialPort:
     def close(self) -> None:
         """Hang up for good."""
         self.hang_up(redial=False)
-        self.bury_ghosts()
+        self.reset_half_open()
 
     def hang_up(self, *, silent: bool = False, redial: bool = True) -> None:
         """End the connection; `silent`: leave it half-open."""
@@ -103,18 +103,18 @@ class DialPort:
             self._loop.remove_reader(line.fileno())
             self._loop.remove_writer(line.fileno())
             if silent:
-                self.ghosts.append(line)
+                self.half_open.append(line)
             else:
                 line.close()
         if redial:
             self.dial_later()
 
-    def bury_ghosts(self) -> None:
+    def reset_half_open(self) -> None:
         """Reset the connections that were left half-open."""
-        for ghost in self.ghosts:
-            ghost.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
-            ghost.close()
-        self.ghosts.clear()
+        for line in self.half_open:
+            line.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
+            line.close()
+        self.half_open.clear()
 
     def dial_later(self) -> None:
         """Dial after the pause between two attempts."""

@@ -41,7 +41,7 @@ class Installation:
 
 
 @dataclass
-class Witness:
+class PortHistory:
     """History of a port for tests, in device time."""
 
     statuses: list[tuple[float, int]] = field(default_factory=list)

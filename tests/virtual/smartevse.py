@@ -197,7 +197,7 @@ class SmartEvse(Device):
         self.controller.power_cycle()
 
     @on_bus_thread
-    def set_by_somebody(self, amps: float) -> None:
+    def set_by_other_master(self, amps: float) -> None:
         """Override the charging current (A) as another client would; 0 ends it."""
         self.outlet.override = round(amps * 10)
 
@@ -230,7 +230,7 @@ class SmartEvse(Device):
             self.unasked += 1
             self.send(data, wait, silence)
 
-    def hear(self, segment: Segment) -> None:
+    def receive(self, segment: Segment) -> None:
         """Receive bytes: more than 3 ms of silence end a frame."""
         bus = self.bus
         if bus is None:

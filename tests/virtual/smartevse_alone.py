@@ -78,7 +78,7 @@ class SmartEvseAlone:
         self.outlet.pilot_voltage = volts
         self.live(seconds)
 
-    def hear(self, data: bytes) -> bytes | None:
+    def receive(self, data: bytes) -> bytes | None:
         """Send it a frame; return its reply."""
         answer = self.box.receive(data, self.now)
         self._collect()
@@ -86,7 +86,7 @@ class SmartEvseAlone:
 
     def read(self, register: int, count: int = 1, function: int = 4) -> list[int]:
         """Read registers; the list is empty for silence and for refusals."""
-        answer = self.hear(read_frame(self.box.unit, register, count, function))
+        answer = self.receive(read_frame(self.box.unit, register, count, function))
         if answer is None or answer[2] != 2 * count:
             return []
         body = answer[ANSWER_HEAD:-2]
@@ -101,7 +101,7 @@ class SmartEvseAlone:
         else:
             request = write_several_frame(unit, register, *values)
             good = frame(unit, function, words(register, len(values)))
-        answer = self.hear(request)
+        answer = self.receive(request)
         if answer is None:
             return "silence"
         if answer == good:

@@ -133,7 +133,7 @@ class SmartEvseController:
             return None
         if self.outlet.load_balance <= MASTER and self.dialect.external_master:
             self.outlet.external_master = 4
-        answer = self._obey(packet)
+        answer = self._execute(packet)
         if answer is None:
             self.ignored += 1
         return answer
@@ -156,7 +156,7 @@ class SmartEvseController:
         self._last_request = this
         return True
 
-    def _obey(self, packet: Packet) -> bytes | None:
+    def _execute(self, packet: Packet) -> bytes | None:
         if self._acknowledge(packet):
             return None
         own = packet.unit == self.unit

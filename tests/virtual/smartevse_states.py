@@ -151,7 +151,7 @@ class SmartEvseStates:
         if self.pilot_current > 0:
             self._offered = True
             return CHARGING if car.accepts(self.pilot_current) else CONNECTED
-        holds = car.requesting and car.asks_without_pwm and self._offered
+        holds = car.requesting and car.requests_without_pwm and self._offered
         return CHARGING if holds or car.current > 0 else CONNECTED
 
     def open_access(self) -> None:

@@ -365,7 +365,7 @@ def test_defects() -> None:
         box.stop_locally()
         assert state(client.ask(READ_FULL)) == b"E0"
         box.start_locally()
-        box.set_by_somebody(8)
+        box.set_by_other_master(8)
         assert duty(client.ask(READ_FULL)) == 133
 
 

@@ -178,7 +178,7 @@ def test_devices_can_come_and_go() -> None:
 
 def test_an_error_inside_is_raised() -> None:
     class Broken(Device):
-        def hear(self, segment: Segment) -> None:
+        def receive(self, segment: Segment) -> None:
             raise LookupError(segment.data.decode())
 
     bus = VirtualBus.pty(Broken("broken")).start()

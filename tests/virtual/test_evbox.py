@@ -10,7 +10,7 @@ import pytest
 from .bus import VirtualBus
 from .car import Car
 from .evbox import EvboxChargePoint, Module
-from .evbox_frames import checksums, frame, orders_in, rude_requests
+from .evbox_frames import checksums, frame, orders_in, requests_without_silence
 from .raw_client import RawClient
 
 MANUAL_69 = b"\x0280A06900E6008C0154003C002800500046F703\x03"
@@ -203,7 +203,7 @@ def test_missing_silence_is_counted() -> None:
         polite(bus)
         ask(client, MANUAL_69)
         assert point.silence_violations == 1
-        assert len(rude_requests(bus.log)) == 1
+        assert len(requests_without_silence(bus.log)) == 1
 
 
 def test_fail_back() -> None:
@@ -278,21 +278,21 @@ def test_modules_come_and_go() -> None:
             point.add_module()
 
 
-def test_lies_end() -> None:
+def test_distorted_values_end() -> None:
     point = EvboxChargePoint(1, two_modules(), min_interval=0)
     with line_to(point) as (bus, client):
         honest = ask(client, command(69))
-        point.lie(1, current=400, cos_phi=5, energy_jump=-100_000)
+        point.distort(1, current=400, cos_phi=5, energy_jump=-100_000)
         polite(bus)
-        lie = ask(client, command(69))[52:]
-        assert lie == "0050" + "0FA0" * 3 + "1388" * 3 + f"{654236:08X}"
+        reported = ask(client, command(69))[52:]
+        assert reported == "0050" + "0FA0" * 3 + "1388" * 3 + f"{654236:08X}"
         polite(bus)
         assert ask(client, command(69)) == honest
-        point.lie(0, times=None, voltage=0)
+        point.distort(0, times=None, voltage=0)
         for _ in range(2):
             polite(bus)
             assert ask(client, command(68, serial="00000000"))[60:72] == "0000" * 3
-        point.honest()
+        point.undistort()
         polite(bus)
         assert ask(client, command(69)) == honest
 

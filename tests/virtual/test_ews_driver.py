@@ -54,7 +54,7 @@ def test_a_request_without_a_start_is_repeated() -> None:
     afternoon.port.release_start("sl 3")
     afternoon.live(60)
     assert afternoon.port.status == Status.CHARGING
-    assert len(afternoon.port.witness.starts) == 1
+    assert len(afternoon.port.history.starts) == 1
 
 
 def test_without_a_server_the_key_starts() -> None:
@@ -64,4 +64,4 @@ def test_without_a_server_the_key_starts() -> None:
     assert afternoon.port.status == Status.CHARGING
     car.leave()
     afternoon.live(60)
-    assert len(afternoon.port.witness.starts) == 1
+    assert len(afternoon.port.history.starts) == 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from .car import Car
-from .ews_orders import Code, obey
+from .ews_orders import Code, execute
 from .ews_port import EwsPort
 from .ews_session import Result
 from .ews_states import Status
@@ -30,13 +30,13 @@ class Bench:
         while self.time < end:
             self.time += 0.05
             self.port.step(self.time)
-            assert not self.port.witness.unlocked_under_power
+            assert not self.port.history.unlocked_under_power
             if self.port.contactor and self.port.has_lock:
                 assert self.port.locked
         return self.port.status
 
     def sl(self, order: int) -> int:
-        return obey(self.port, order, lambda port: setattr(port, "start_mode", 1))
+        return execute(self.port, order, lambda port: setattr(port, "start_mode", 1))
 
     def charging(self) -> Bench:
         self.car.plug_in()
@@ -60,7 +60,7 @@ def test_a_whole_charge(bench: Bench) -> None:
     bench.live()
     bench.car.leave()
     bench.live()
-    statuses = [status for _, status in bench.port.witness.statuses]
+    statuses = [status for _, status in bench.port.history.statuses]
     assert statuses == [0x10, 0x30, 0x42, 0x40, 0x50, 0x00]
     session = bench.port.session
     assert session.result == Result.STOPPED
@@ -222,7 +222,7 @@ def test_the_rcd_of_an_idle_port(bench: Bench) -> None:
     assert bench.live() == Status.RCD
     bench.port.rcd_tripped = False
     assert bench.live() == Status.NOT_CONNECTED
-    assert len(bench.port.witness.statuses) == 2
+    assert len(bench.port.history.statuses) == 2
 
 
 def test_a_lock_that_does_not_lock(bench: Bench) -> None:
@@ -305,7 +305,7 @@ def test_the_offer_is_the_lowest_of_all_limits(bench: Bench) -> None:
     port.limit = 0
     bench.live(10)
     assert max(port.currents) == pytest.approx(16)
-    assert port.witness.highest_offer == 20
+    assert port.history.highest_offer == 20
 
 
 def test_ventilation(bench: Bench) -> None:
@@ -372,7 +372,7 @@ def test_power_failure_opens_everything(bench: Bench) -> None:
     assert bench.sl(1) == bench.sl(3) == bench.sl(7) == Code.INITIALISING
     assert bench.live() == Status.CHARGING
     assert bench.port.offered == 32
-    assert [cause for _, cause in bench.port.witness.starts] == [
+    assert [cause for _, cause in bench.port.history.starts] == [
         "sl 3",
         "power failure",
     ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given, settings, strategies as st
 
 from .car import Car
-from .ews_orders import obey
+from .ews_orders import execute
 from .ews_port import EwsPort
 from .ews_states import Status
 
@@ -22,7 +22,7 @@ EVENTS = (
 
 def do(port: EwsPort, car: Car, event: str | int, now: float) -> None:
     if isinstance(event, int):
-        obey(port, event, lambda asked: asked.release_start("key"))
+        execute(port, event, lambda asked: asked.release_start("key"))
     elif event == "rcd":
         port.rcd_tripped = not port.rcd_tripped
     elif event.startswith("jam"):
@@ -78,8 +78,8 @@ def test_no_sequence_breaks_the_rules(
             if port.server_paused:
                 assert port.locked or not port.has_lock
             assert max(port.currents) <= port.ceiling
-            before, status = len(port.witness.statuses), port.status
+            before, status = len(port.history.statuses), port.status
             port.step(now)
-            assert (len(port.witness.statuses), port.status) == (before, status)
-    unlocked = port.witness.unlocked_under_power
+            assert (len(port.history.statuses), port.status) == (before, status)
+    unlocked = port.history.unlocked_under_power
     assert not unlocked or "weld" in events

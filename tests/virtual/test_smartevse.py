@@ -76,7 +76,7 @@ def test_a_car_comes_charges_and_leaves() -> None:
 def test_pilot_without_pwm() -> None:
     """A real car ends its request when the PWM stops; a defective one does not."""
     for odd in (False, True):
-        alone = charging(car=Car(asks_without_pwm=odd))
+        alone = charging(car=Car(requests_without_pwm=odd))
         assert alone.write(0xA7, 0) == "ok"
         alone.live(0.1)
         assert alone.outlet.pilot == (6 if odd else 9)
@@ -171,23 +171,23 @@ def test_every_second_single_write_is_dropped() -> None:
     # After a read, another function or a request to another unit it is a request.
     for between in (read_frame(0, 0xA0, 1), read_frame(7, 0, 1), write_frame(9, 1, 1)):
         assert alone.write(0xA7, 1, function=6) == "ok"
-        alone.hear(between)
+        alone.receive(between)
     assert [alone.write(0xA7, 1) for _ in range(3)] == ["ok"] * 3
     # Unknown frames change nothing.
-    alone.hear(read_frame(0, 0xA0, 1))
+    alone.receive(read_frame(0, 0xA0, 1))
     alone.write(0xA7, 1, function=6)
-    alone.hear(read_frame(0, 0xA0, 1, function=3))
+    alone.receive(read_frame(0, 0xA0, 1, function=3))
     assert alone.write(0xA7, 1, function=6) == "silence"
 
 
 def test_unit_is_the_load_balance_setting() -> None:
     alone = SmartEvseAlone("2.17", load_balance=3)
-    assert alone.hear(read_frame(0, 0xA0, 9)) is None
-    assert alone.hear(read_frame(3, 0xA0, 9))
+    assert alone.receive(read_frame(0, 0xA0, 9)) is None
+    assert alone.receive(read_frame(3, 0xA0, 9))
     # A broadcast write is accepted, without a reply.
-    assert alone.hear(write_several_frame(0, 0xA7, 0)) is None
+    assert alone.receive(write_several_frame(0, 0xA7, 0)) is None
     assert not alone.outlet.access
-    assert alone.hear(write_several_frame(2, 0xA7, 1)) is None
+    assert alone.receive(write_several_frame(2, 0xA7, 1)) is None
     assert not alone.outlet.access
 
 
@@ -210,10 +210,10 @@ def test_refusals() -> None:
     assert alone.write(0xA7, 2) == "refused 3"
     assert alone.write(0xC2, 17) == "refused 3"
     assert alone.write(0xA9, 1) == "refused 2"
-    assert alone.hear(read_frame(0, 0xA8, 2)) is None
-    assert alone.hear(read_frame(0, 0xA7, 3)) == frame(0, 4, b"\x02")
+    assert alone.receive(read_frame(0, 0xA8, 2)) is None
+    assert alone.receive(read_frame(0, 0xA7, 3)) == frame(0, 4, b"\x02")
     # Of two values one is accepted; the reply has that count.
-    answer = alone.hear(write_several_frame(0, 0xA6, 80, 0))
+    answer = alone.receive(write_several_frame(0, 0xA6, 80, 0))
     assert answer == frame(0, 16, bytes.fromhex("00a60001"))
     for register in (*range(1, 5), 0x81, 0x82, 0x84):
         assert alone.write(register, 0, function=6) == "silence"
@@ -267,7 +267,7 @@ def test_the_button_at_the_box() -> None:
 
 def test_0x83_closes_the_contactor_of_a_box_that_is_no_slave() -> None:
     alone = SmartEvseAlone("2.17", Car())
-    assert alone.hear(write_frame(0, 0x83, 160)) is None
+    assert alone.receive(write_frame(0, 0x83, 160)) is None
     assert alone.outlet.contactor
 
 
@@ -362,7 +362,7 @@ def test_defects() -> None:
     assert alone.read(0xA7) == [1]
     assert alone.outlet.contactor
     box = SmartEvse()
-    box.set_by_somebody(10)
+    box.set_by_other_master(10)
     assert box.outlet.override == 100
     box.set_at_the_box("max_current", 16)
     assert box.outlet.settings["max_current"] == 16

@@ -25,11 +25,11 @@ def charging(dialect: str = "later", car: Car | None = None) -> SmartEvseAlone:
 def test_status_of_220(function: int) -> None:
     alone = SmartEvseAlone("2.20", Car(), max_current=20, cable=32)
     assert alone.read(0xA0, 12, function) == [0, 0, 0, 6, 0, 0, 0, 1, 0, 0, 12, 0]
-    assert alone.hear(read_frame(0, 0xA0, 12)) is None
+    assert alone.receive(read_frame(0, 0xA0, 12)) is None
     assert alone.read(0xC0, 4) == [0, 0, 6, 20]
     assert alone.read(0xE0, 3) == [16, 0, 25]
-    assert alone.hear(read_frame(1, 0xAC, 1)) == frame(1, 4, b"\x02")
-    assert SmartEvseAlone("2.20", unit=0).hear(read_frame(0, 0xA0, 12))
+    assert alone.receive(read_frame(1, 0xAC, 1)) == frame(1, 4, b"\x02")
+    assert SmartEvseAlone("2.20", unit=0).receive(read_frame(0, 0xA0, 12))
 
 
 @pytest.mark.parametrize("function", [3, 4])
@@ -37,7 +37,7 @@ def test_status_of_later(function: int) -> None:
     alone = SmartEvseAlone("later", Car(), serial=4711)
     want = [0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 293, 4711]
     assert alone.read(0x0000, 12, function) == want
-    assert alone.hear(read_frame(1, 0xA0, 9)) == frame(1, 4, b"\x02")
+    assert alone.receive(read_frame(1, 0xA0, 9)) == frame(1, 4, b"\x02")
     assert alone.read(0x0100, 5) == [0, 0, 6, 13, 0]
     assert alone.read(0x0200, 8) == [0, 16, 0, 1024, 25, 12, 0, 48]
 
@@ -81,7 +81,7 @@ def test_access_stops_gently() -> None:
 
 
 def test_a_car_that_does_not_stop_has_six_seconds() -> None:
-    alone = charging(car=Car(asks_without_pwm=True))
+    alone = charging(car=Car(requests_without_pwm=True))
     alone.write(5, 0)
     alone.live(5)
     assert alone.outlet.contactor
@@ -99,7 +99,7 @@ def test_polling_all_the_time_ends_in_no_comm() -> None:
     """Its own cycle does not run while there are requests, to any address."""
     alone = charging()
     for _ in range(6):
-        alone.hear(read_frame(77, 0, 1))
+        alone.receive(read_frame(77, 0, 1))
         alone.live(2)
     alone.live(0.5)
     assert alone.outlet.error == NO_COMM
@@ -168,7 +168,7 @@ def test_slaves_follow_unit_9(dialect: str, register: int, after: str) -> None:
 
     def broadcast(current: int) -> None:
         data = write_several_frame(9, register, 0, current, *[0] * 6)
-        assert alone.hear(data) is None
+        assert alone.receive(data) is None
 
     broadcast(60)
     car.plug_in()

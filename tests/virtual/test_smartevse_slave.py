@@ -37,7 +37,7 @@ class Slave(SmartEvseAlone):
     def broadcast(self, word: int | None = None) -> None:
         self.word = self.word if word is None else word
         data = write_several_frame(0, 1, 0, self.word, 0, 0)
-        assert self.hear(data) is None
+        assert self.receive(data) is None
 
     def mastered(self, seconds: float) -> None:
         """Let time pass with a broadcast every 2 s, and no acknowledgements."""
@@ -47,7 +47,7 @@ class Slave(SmartEvseAlone):
             seconds -= 2.0
 
     def acknowledge(self, register: int, value: int = 60) -> None:
-        assert self.hear(write_frame(2, register, value)) is None
+        assert self.receive(write_frame(2, register, value)) is None
 
     def charge(self) -> None:
         """Start a charge of 6 A."""
@@ -191,7 +191,7 @@ def test_access_off_stops_one_slave() -> None:
 
 
 def test_after_access_a_car_must_have_ended_its_request() -> None:
-    slave = Slave(Car(asks_without_pwm=True))
+    slave = Slave(Car(requests_without_pwm=True))
     slave.charge()
     slave.write(0xA7, 0)
     slave.write(0xA7, 1)
@@ -205,7 +205,7 @@ def test_after_access_a_car_must_have_ended_its_request() -> None:
 
 def test_a_late_acknowledgement_starts_a_stopped_car() -> None:
     """0x83 closes the contactor in any state, also without access."""
-    slave = Slave(Car(asks_without_pwm=True))
+    slave = Slave(Car(requests_without_pwm=True))
     slave.charge()
     slave.write(0xA7, 0)
     slave.acknowledge(ACK_C)
@@ -227,7 +227,7 @@ def test_0x84_to_a_charging_slave_leaves_the_contactor_closed() -> None:
 def test_error_broadcast_stops_for_a_minute() -> None:
     slave = Slave()
     slave.charge()
-    assert slave.hear(write_frame(0, 2, LESS_6A)) is None
+    assert slave.receive(write_frame(0, 2, LESS_6A)) is None
     assert (slave.state, slave.outlet.contactor) == ("A", False)
     slave.mastered(56)
     assert slave.outlet.error == LESS_6A
@@ -235,8 +235,8 @@ def test_error_broadcast_stops_for_a_minute() -> None:
     assert slave.outlet.error == 0
     # A master that clears its errors clears those of the slave.
     slave.charge()
-    slave.hear(write_frame(0, 2, 0x20))
-    slave.hear(write_frame(0, 2, 0))
+    slave.receive(write_frame(0, 2, 0x20))
+    slave.receive(write_frame(0, 2, 0))
     assert slave.outlet.error == 0
     assert slave.state == "A"
 
@@ -270,7 +270,7 @@ def test_frames_that_are_no_broadcasts() -> None:
         write_several_frame(0, 1, 100),
         write_frame(0, 1, 100),
     ):
-        slave.hear(other)
+        slave.receive(other)
         assert slave.read(0xA6) == [60]
 
 
@@ -281,7 +281,7 @@ def test_a_master_broadcasts_and_acknowledges() -> None:
     master.sent.clear()
 
     def ask(unit: int, register: int, value: int = 130) -> int:
-        assert master.hear(write_frame(unit, register, value)) is None
+        assert master.receive(write_frame(unit, register, value)) is None
         answer = master.sent.pop()[1]
         assert answer[:4] == bytes((unit, 6, 0, 0x80 | register))
         return int.from_bytes(answer[4:6], "big")
@@ -335,5 +335,5 @@ def test_another_master_of_a_later_dialect() -> None:
 
 def test_a_read_of_another_unit_is_ignored() -> None:
     slave = Slave()
-    assert slave.hear(read_frame(3, 0xA0, 9)) is None
-    assert slave.hear(read_frame(2, 0xA0, 9))
+    assert slave.receive(read_frame(3, 0xA0, 9)) is None
+    assert slave.receive(read_frame(2, 0xA0, 9))

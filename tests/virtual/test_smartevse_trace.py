@@ -60,7 +60,7 @@ class Recording(SmartEvseAlone):
         self.outlet.pilot_voltage = 12
 
     def hear_hex(self, request: str) -> str | None:
-        answer = self.hear(bytes.fromhex(request))
+        answer = self.receive(bytes.fromhex(request))
         return answer.hex() if answer else None
 
     @property

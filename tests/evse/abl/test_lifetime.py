@@ -45,7 +45,7 @@ async def test_a_higher_fail_safe_is_written_once() -> None:
             config(order_lifetime=1.0), orders(6, fail_safe=10)
         )
         await until(lambda: scene.writes() == [100, 166])
-        box.set_by_somebody(7)
+        box.set_by_other_master(7)
         await scene.polled(charger, 4)
         assert scene.writes() == [100, 166]
 

@@ -95,7 +95,7 @@ async def test_a_limit_does_not_end_a_pause_by_others(
     box = AblBox(1, car=plugged())
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders(allowed=allowed))
-        box.set_by_somebody(0)
+        box.set_by_other_master(0)
         await scene.polled(charger)
         assert charger.reading is not None
         assert charger.reading.allowed is False
@@ -173,9 +173,9 @@ async def test_permission_is_never_given_without_the_user() -> None:
     box = AblBox(1, car=plugged())
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders(allowed=True))
-        box.set_by_somebody(0)
+        box.set_by_other_master(0)
         await scene.polled(charger, 5)
-        box.set_by_somebody(8)
+        box.set_by_other_master(8)
         await scene.polled(charger, 5)
         # Neither a pause nor a lower limit set by others is undone.
         assert scene.writes() == []

@@ -107,7 +107,7 @@ class Ether(Line):
             self.on_data(self.damage(segment.data))
         for point in self.points:
             if point.name != source and not point.faults.dead:
-                point.hear(segment)
+                point.receive(segment)
 
     def foreign(self, data: bytes) -> None:
         """Send bytes of another station now."""

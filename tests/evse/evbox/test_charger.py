@@ -466,15 +466,15 @@ def test_a_stray_wrong_value_is_never_shown() -> None:
             charger = stage.add()
             await asyncio.sleep(10.0)
             before = charger.reading
-            lies: tuple[dict[str, float], ...] = (
+            distortions: tuple[dict[str, float], ...] = (
                 {"current": 60.0},
                 {"cos_phi": 1.5},
                 {"voltage": 500.0},
                 {"energy_jump": 100_000},
                 {"energy_jump": -1000},
             )
-            for number, lie in enumerate(lies, 1):
-                point.lie(**lie)
+            for number, values in enumerate(distortions, 1):
+                point.distort(**values)
                 with updates(charger) as calls:
                     await asyncio.sleep(10.0)
                 assert calls == []
@@ -491,13 +491,13 @@ def test_implausible_values_that_stay_are_shown_with_a_fault() -> None:
         async with Scene.of(point) as stage:
             charger = stage.add()
             await asyncio.sleep(10.0)
-            point.lie(cos_phi=1.5, times=None)
+            point.distort(cos_phi=1.5, times=None)
             await asyncio.sleep(15.0)
             assert charger.reading is not None
             assert charger.reading.connectors[1].cos_phi == (1.5, 1.5, 1.5)
             assert charger.faults == {Fault.IMPLAUSIBLE}
             assert charger.statistics.implausible == 2
-            point.honest()
+            point.undistort()
             await asyncio.sleep(10.0)
             assert charger.faults == frozenset()
 
@@ -510,12 +510,12 @@ def test_a_real_over_current_is_shown() -> None:
         async with Scene.of(point) as stage:
             charger = stage.add()
             await asyncio.sleep(40.0)
-            point.lie(current=60.0, times=None)
+            point.distort(current=60.0, times=None)
             await asyncio.sleep(20.0)
             assert charger.reading is not None
             assert charger.reading.connectors[1].current == (60.0, 60.0, 60.0)
             assert charger.faults == {Fault.OVERCURRENT, Fault.LIMIT_EXCEEDED}
-            point.honest()
+            point.undistort()
             await asyncio.sleep(10.0)
             assert charger.faults == frozenset()
 
@@ -529,8 +529,10 @@ def test_inconsistent_implausible_replies_make_it_unavailable() -> None:
             charger = stage.add()
             await asyncio.sleep(10.0)
             for number in range(12):
-                point.honest()
-                point.lie(**({"cos_phi": 1.5} if number % 2 else {"voltage": 400.0}))
+                point.undistort()
+                point.distort(
+                    **({"cos_phi": 1.5} if number % 2 else {"voltage": 400.0})
+                )
                 count = len(point.orders)
                 await until(lambda at=count: len(point.orders) > at)  # type: ignore[misc]
             assert not charger.available
@@ -588,7 +590,7 @@ def test_a_command_is_repeated_until_its_reply_is_accepted() -> None:
         async with Scene.of(point) as stage:
             charger = stage.add()
             await asyncio.sleep(10.0)
-            point.lie(voltage=400.0, times=2)
+            point.distort(voltage=400.0, times=2)
             await charger.change_orders(OrderChange(current=20.0))
             assert [order.limits[0] for order in stage.ether.orders[-3:]] == 3 * [20.0]
             assert charger.orders.limit.current == 20.0

@@ -124,7 +124,7 @@ class Ether(Line):
         assert self.box is not None
         self._name = name
         end = now()
-        self.box.hear(Segment(end - len(data) * BYTE, BYTE, data, (CLIENT,), end))
+        self.box.receive(Segment(end - len(data) * BYTE, BYTE, data, (CLIENT,), end))
 
     def say(self, data: bytes) -> None:
         """Let the box send bytes: one after the other."""
@@ -241,11 +241,11 @@ class EwsScene:
 
     def unlocked(self, port: int = 1) -> list[str]:
         """Return why a port's lock has opened."""
-        return [one.reason for one in self.box.ports[port - 1].witness.unlockings]
+        return [one.reason for one in self.box.ports[port - 1].history.unlockings]
 
     def starts(self, port: int = 1) -> list[str]:
         """Return what has started a port's charges."""
-        return [cause for _, cause in self.box.ports[port - 1].witness.starts]
+        return [cause for _, cause in self.box.ports[port - 1].history.starts]
 
     # -- Time ----------------------------------------------------------------------
 

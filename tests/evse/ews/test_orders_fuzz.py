@@ -115,13 +115,13 @@ def test_any_orders(
         await asyncio.sleep(60)
         if not any(what == "unlock" for what, *_ in acts):
             assert not scene.unlocked()
-        assert not port.witness.unlocked_under_power
+        assert not port.history.unlocked_under_power
         said = scene.line.sent[begun:]
         assert all(one.parameters[1] for one in said if one.name == "st")
         if not wanted and not charging:
             assert not scene.starts()
         ceiling = 25
-        assert port.witness.highest_offer <= ceiling
+        assert port.history.highest_offer <= ceiling
         orders = scene.charger().orders
         if scene.charger().setpoint.paused:
             assert port.status not in (0x40, 0x41)

@@ -181,7 +181,7 @@ def judged(acts: list[Act], *, pause_status: int, flag: str, begin: str) -> EwsS
         assert not run.wrong
         names = [what for (what, _), *_ in acts]
         for number, port in enumerate(scene.box.ports, start=1):
-            assert not port.witness.unlocked_under_power
+            assert not port.history.unlocked_under_power
             unlocked = [one for one in scene.unlocked(number) if one == "sl 6"]
             if "unlock" not in names:
                 assert not unlocked

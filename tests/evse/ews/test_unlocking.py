@@ -365,7 +365,7 @@ def test_a_lock_that_jams() -> None:
 def test_a_refusal_says_why(code: int, monkeypatch: pytest.MonkeyPatch) -> None:
     async def acts(scene: EwsScene) -> None:
         await pause(scene)
-        monkeypatch.setattr(ews_commands, "obey", lambda *_: code)
+        monkeypatch.setattr(ews_commands, "execute", lambda *_: code)
         since = now()
         with pytest.raises(EwsRefusedError) as told:
             await scene.charger().command(Command.UNLOCK)

@@ -46,7 +46,7 @@ class Witness(Device):
             self.opened_at = self.now()
 
     @override
-    def hear(self, segment: object) -> None:
+    def receive(self, segment: object) -> None:
         pass
 
 

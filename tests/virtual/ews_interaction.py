@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 ROM_SIZE = 3 * 0x10000
 
 
-class EwsHands(Device):
+class EwsInteraction(Device):
     """The part of a box that is operated from outside, from any thread."""
 
     ports: tuple[EwsPort, EwsPort]
