@@ -114,7 +114,7 @@ class VirtualBus(LoopThread):
 
     @classmethod
     def in_loop(cls, *devices: Device, **options: float | str | None) -> VirtualBus:
-        """Make a bus that lives on the running loop, on a `DirectPort`."""
+        """Make a bus on the running loop, on a `DirectPort`."""
 
         def make(bus: VirtualBus) -> Port:
             return DirectPort(bus.wire.send_client)

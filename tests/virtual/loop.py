@@ -44,7 +44,7 @@ class PreciseLoop(asyncio.SelectorEventLoop):
 
 
 class BorrowedLoop:
-    """Somebody else's loop that a bus lives on: its timers end with the bus."""
+    """The loop of another owner that a bus runs on: its timers end with the bus."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop | BorrowedLoop) -> None:
         """Borrow a loop."""
@@ -61,7 +61,7 @@ class BorrowedLoop:
         callback: Callable[..., object],
         *args: Any,  # noqa: ANN401 - as of a loop
     ) -> asyncio.TimerHandle:
-        """Call something at a time, unless the loop is given back before."""
+        """Call a function at a time, unless the loop is given back before."""
         timer = self._loop.call_at(when, callback, *args)
         self._timers.add(timer)
         return timer
@@ -72,7 +72,7 @@ class BorrowedLoop:
         callback: Callable[..., object],
         *args: Any,  # noqa: ANN401 - as of a loop
     ) -> asyncio.TimerHandle:
-        """Call something after a time, unless the loop is given back before."""
+        """Call a function after a time, unless the loop is given back before."""
         return self.call_at(self._loop.time() + delay, callback, *args)
 
     def give_back(self) -> None:
@@ -97,7 +97,7 @@ class LoopThread:
     def __init__(self, name: str, *, own_thread: bool = True) -> None:
         """Prepare; nothing runs before `start_thread`.
 
-        Without an `own_thread` it lives on the loop of its caller, in its time.
+        Without `own_thread` it runs on the loop of its caller, in the time of that loop.
         """
         self._thread_name = name
         self._thread: threading.Thread | None = None
@@ -144,7 +144,7 @@ class LoopThread:
         self._loop = loop
 
     def share_thread(self, other: LoopThread) -> None:
-        """Live on the thread of another."""
+        """Run on the thread of another bus."""
         self._loop = BorrowedLoop(other.loop)
         self._thread = other._thread
 

@@ -142,7 +142,7 @@ class PtyPort:
     def _chore(self) -> None:
         """Detect a client, and keep the next open possible."""
         # A client may also have opened, written and closed since the last time.
-        if not self._reading and self._somebody_was_here():
+        if not self._reading and self._client_was_here():
             self._reading = True
             self.opened += 1
             self._loop.add_reader(self._master, self._readable)
@@ -165,7 +165,7 @@ class PtyPort:
                 attributes[4] = attributes[5] = termios.B50
                 termios.tcsetattr(self._master, termios.TCSANOW, attributes)
 
-    def _somebody_was_here(self) -> bool:
+    def _client_was_here(self) -> bool:
         poll = select.poll()
         poll.register(self._master, select.POLLIN)
         events = poll.poll(0)
@@ -203,21 +203,21 @@ class PtyPort:
 
 
 class DirectTransport:
-    """A client's end of a `DirectPort`, as of a serial port that is open."""
+    """The client's end of an open `DirectPort`."""
 
     def __init__(self, port: DirectPort, protocol: asyncio.Protocol) -> None:
-        """Take what the client hears with."""
+        """Take the protocol of the client."""
         self.protocol = protocol
         self._port = port
         self._closed = asyncio.get_running_loop().create_future()
 
     def write(self, data: bytes) -> None:
-        """Send bytes, at once as a driver takes them."""
+        """Send bytes; they are taken at once, as by a driver."""
         if self._port.client is self:
             self._port.on_bytes(bytes(data))
 
     def close(self) -> None:
-        """Close; the client is told soon."""
+        """Close; `connection_lost` is called soon."""
         self.end(None)
 
     async def wait_closed(self) -> None:
@@ -225,7 +225,7 @@ class DirectTransport:
         await self._closed
 
     def end(self, error: Exception | None) -> None:
-        """End the connection, told to the client soon."""
+        """End the connection; `connection_lost` is called soon."""
         if self._port.client is self:
             self._port.client = None
             loop = asyncio.get_running_loop()
@@ -242,7 +242,7 @@ class DirectPort:
     _numbers = itertools.count()
 
     def __init__(self, on_bytes: Callable[[bytes], None]) -> None:
-        """Choose a name that no other has."""
+        """Choose a unique name."""
         self.on_bytes = on_bytes
         self.client: DirectTransport | None = None
         self.overruns = 0
@@ -258,12 +258,12 @@ class DirectPort:
 
     @property
     def connected(self) -> bool:
-        """Tell whether a client has it open."""
+        """Return whether a client has it open."""
         return self.client is not None
 
     @classmethod
     def find(cls, url: str) -> DirectPort | None:
-        """Return the port of a name, or of a link to it; also while it is unplugged."""
+        """Return the port of a name or of a link to it, unplugged or not."""
         return cls.ports.get(os.path.realpath(url))
 
     def open(self, protocol: asyncio.Protocol) -> DirectTransport:
@@ -278,17 +278,17 @@ class DirectPort:
         return self.client
 
     def plug(self) -> None:
-        """Make it appear."""
+        """Let clients open it."""
         self._plugged = True
 
     def unplug(self) -> None:
-        """Make it vanish; the client loses it."""
+        """Remove it from clients; the one that has it open loses it."""
         self._plugged = False
         if self.client is not None:
             self.client.end(OSError(errno.EIO, os.strerror(errno.EIO)))
 
     def write(self, data: bytes) -> None:
-        """Give bytes to the client."""
+        """Send bytes to the client."""
         if self.client is not None:
             self.client.protocol.data_received(data)
 
@@ -296,7 +296,7 @@ class DirectPort:
         """Do nothing."""
 
     def close(self) -> None:
-        """Take everything away."""
+        """Remove the port and its name."""
         self.unplug()
         del self.ports[self._url]
 
@@ -367,7 +367,7 @@ class TcpPort:
         """Do nothing: a socket needs no preparation."""
 
     def close(self) -> None:
-        """Remove the port and its files."""
+        """Close the connection and the port."""
         self.unplug()
 
     def _accept(self) -> None:
