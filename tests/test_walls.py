@@ -59,6 +59,67 @@ def local(path: Path, root: Path) -> set[str]:
     return {name[1:] for name in imports(path, root) if name.startswith("~")}
 
 
+def files(root: Path) -> dict[str, Path]:
+    """Return all files below ``root`` by their module name; a package by its own."""
+    found = {}
+    for path in root.rglob("*.py"):
+        parts = path.relative_to(root).with_suffix("").parts
+        found[".".join(part for part in parts if part != "__init__")] = path
+    return found
+
+
+def graph(root: Path) -> dict[str, set[str]]:
+    """Return which files import which; imports for type checking count too.
+
+    ``from .a import b`` imports the file ``a.b`` where there is one, else ``a``.
+    """
+    modules = files(root)
+    found: dict[str, set[str]] = {}
+    for name, path in modules.items():
+        package = path.relative_to(root).parent.parts
+        used = set()
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.ImportFrom) or not node.level:
+                continue
+            base = package[: len(package) - node.level + 1]
+            stem = ".".join((*base, *(node.module or "").split("."))).strip(".")
+            for one in node.names:
+                inner = f"{stem}.{one.name}".strip(".")
+                used.add(inner if inner in modules else stem)
+        found[name] = used & modules.keys() - {name}
+    return found
+
+
+def circles(used: dict[str, set[str]]) -> list[set[str]]:
+    """Return the sets of files that import each other, by whatever way."""
+
+    def reached(start: str) -> set[str]:
+        seen: set[str] = set()
+        waiting = list(used[start])
+        while waiting:
+            name = waiting.pop()
+            if name not in seen:
+                seen.add(name)
+                waiting.extend(used[name])
+        return seen
+
+    all_reached = {name: reached(name) for name in used}
+    found: list[set[str]] = []
+    for name, seen in all_reached.items():
+        if name in seen and not any(name in circle for circle in found):
+            found.append({other for other in seen if name in all_reached[other]})
+    return found
+
+
+def test_no_file_imports_itself_by_any_way() -> None:
+    assert circles(graph(INTEGRATION)) == []
+
+
+def test_a_circle_is_found() -> None:
+    used = {"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": {"a"}}
+    assert circles(used) == [{"b", "c"}]
+
+
 def outside(path: Path, root: Path) -> set[str]:
     found = (name for name in imports(path, root) if not name.startswith("~"))
     return {name.split(".")[0] for name in found}
