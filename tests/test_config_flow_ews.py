@@ -62,7 +62,7 @@ async def test_box_is_found_added_and_runs(hass: HomeAssistant) -> None:
 
         await flow.submit({"chargers": SERIAL})
         assert flow.step == "box"
-        assert flow.tells(SERIAL, "firmware M165300103", "port by port: 13 A + 10 A")
+        assert flow.tells(SERIAL, "firmware M165300103", "for each port: 13 A + 10 A")
         # Nothing that it has told is asked, and no more offered than it can.
         assert fields(flow) == {
             "name": "EWS-Box",
@@ -122,7 +122,7 @@ async def test_box_with_one_port_is_one_charger(hass: HomeAssistant) -> None:
     with VirtualBus.in_loop(EwsBox(serial=SERIAL, ports=1)) as bus:
         flow = await searched(hass, bus)
         await flow.submit({"chargers": SERIAL})
-        assert flow.tells("port by port: 32 A.")
+        assert flow.tells("for each port: 32 A.")
         offered = fields(flow)
         assert offered["ports"] == "1"
         assert offered["installation_limit"] == 16
@@ -148,7 +148,7 @@ async def test_household_socket_is_offered_what_it_needs(hass: HomeAssistant) ->
     with VirtualBus.in_loop(box) as bus:
         flow = await searched(hass, bus)
         await flow.submit({"chargers": SERIAL})
-        assert flow.tells("port by port: 10 A + 16 A")
+        assert flow.tells("for each port: 10 A + 16 A")
         assert fields(flow)["installation_limit"] == 10
         assert fields(flow)["installation_limit_2"] == 16
         flow.abort()

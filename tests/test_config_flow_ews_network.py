@@ -192,7 +192,7 @@ async def test_listener_moves_to_another_port(hass: HomeAssistant) -> None:
 
         flow = await Flow.change_bus(hass, entry)
         assert flow.step == "reconfigure_listen"
-        assert flow.tells("new address of its server")
+        assert flow.tells("new address of the server")
         assert fields(flow) == {"host": HOST, "port": first}
         await flow.submit({"host": HOST, "port": "nan"})
         assert flow.errors == {"port": "bad_port"}

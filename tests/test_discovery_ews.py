@@ -57,7 +57,7 @@ async def test_box_that_dials_is_offered_and_added(hass: HomeAssistant) -> None:
 
             await flow.submit()
             assert flow.step == "box"
-            assert flow.tells(SERIAL, "firmware M165300103", "port by port: ?.")
+            assert flow.tells(SERIAL, "firmware M165300103", "for each port: ?.")
             # It has not been asked for its ports, so nothing is known of them.
             assert fields(flow) == {
                 "name": f"EWS-Box {SERIAL[-8:]}",

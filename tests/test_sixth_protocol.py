@@ -109,7 +109,7 @@ async def test_it_is_offered_searched_and_added(hass: HomeAssistant) -> None:
         assert flow.step == "select"
         assert fields(flow)["chargers"] == ["3", "8"]
         await flow.submit({"chargers": ["3"], "installation_limit": 13})
-        assert flow.tells("Charger 1 of 1", SERIAL, "maximum of its own 16 A")
+        assert flow.tells("Charger 1 of 1", SERIAL, "own maximum 16 A")
         assert fields(flow)["name"] == "Sextant 3"
         assert fields(flow)["expert"]["lamp"] == 40
         await flow.submit(charger("Garage", 13, expert={"lamp": 55}))
