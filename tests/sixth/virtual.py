@@ -26,12 +26,12 @@ class VirtualSextant(Device):
         self.charging = False
         self.key_switch = True
         self.limits: list[int] = []
-        self._heard = ""
+        self._buffer = ""
 
-    def hear(self, segment: Segment) -> None:
-        self._heard += segment.data.decode("latin-1")
-        while "\r" in self._heard:
-            line, self._heard = self._heard.split("\r", 1)
+    def receive(self, segment: Segment) -> None:
+        self._buffer += segment.data.decode("latin-1")
+        while "\r" in self._buffer:
+            line, self._buffer = self._buffer.split("\r", 1)
             body, _, checksum = line.removeprefix("$").partition("*")
             if body[:1] == str(self.dial) and checksum == _checksum(body):
                 self.requests += 1
