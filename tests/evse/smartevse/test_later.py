@@ -1,4 +1,4 @@
-"""Later dialects need quiet: their own cycle stands still while others ask."""
+"""Later dialects need quiet: any request on the line suspends their own cycle."""
 
 import asyncio
 from itertools import pairwise
@@ -16,7 +16,7 @@ NO_COMM = 2
 
 
 def bursts(scene: PolledScene) -> list[list[float]]:
-    """Return requests by burst: what follows within a second belongs to one."""
+    """Return the times of requests by burst: less than a second apart."""
     found: list[list[float]] = []
     for sent in scene.line.sent:
         if found and sent.when - found[-1][-1] < 1.0:
@@ -32,7 +32,7 @@ def quiets(scene: PolledScene) -> list[float]:
 
 
 def test_polled_without_quiet_it_stops_with_no_comm() -> None:
-    """What the library must not do: a reader that asks every 3 s."""
+    """The library must not do so: read the box every 3 s."""
 
     async def acts(scene: PolledScene) -> None:
         await scene.charge()
@@ -51,7 +51,7 @@ def test_polled_without_quiet_it_stops_with_no_comm() -> None:
     play(PolledScene(LATER), acts)
 
 
-def test_polled_by_us_it_never_does() -> None:
+def test_polled_by_the_library_it_does_not_stop() -> None:
     async def acts(scene: PolledScene) -> None:
         errors = []
         scene.seen.append(lambda: errors.append(scene.outlet.error))
@@ -67,11 +67,11 @@ def test_polled_by_us_it_never_does() -> None:
 
     scene = play(PolledScene(LATER, poll_interval=0.5), acts)
     assert min(quiets(scene)) >= QUIET - 0.1
-    # And it is not asked less often than it could be.
+    # Nor is it read less often than possible.
     assert max(quiets(scene)) < QUIET + 1.0
 
 
-def test_commands_wait_for_the_quiet_and_pauses_do_not() -> None:
+def test_commands_wait_for_the_quiet_but_pauses_do_not() -> None:
     async def acts(scene: PolledScene) -> None:
         await scene.charge()
         await scene.polled(3)
@@ -88,7 +88,7 @@ def test_commands_wait_for_the_quiet_and_pauses_do_not() -> None:
     play(PolledScene(LATER), acts)
 
 
-def test_other_requests_on_the_line_count_as_well() -> None:
+def test_requests_to_other_addresses_disturb_the_quiet_too() -> None:
     async def acts(scene: PolledScene) -> None:
         errors = []
         scene.seen.append(lambda: errors.append(scene.outlet.error))

@@ -1,4 +1,4 @@
-"""The master's broadcast: its period, whatever else the bus does."""
+"""The period of the master's broadcast, whatever else the bus does."""
 
 import asyncio
 from contextlib import suppress
@@ -22,7 +22,7 @@ from tests.simulated_time import now, simulate
 GARBAGE = bytes(range(1, 40))
 
 
-def test_it_listens_then_looks_then_speaks() -> None:
+def test_it_listens_then_reads_then_broadcasts() -> None:
     async def scene() -> None:
         scene = MasterScene()
         begin = now()
@@ -58,7 +58,7 @@ def test_its_period_does_not_drift() -> None:
 
 
 class Trouble:
-    """Everything that can happen beside the broadcasts, at random."""
+    """Random events beside the broadcasts."""
 
     def __init__(self, scene: MasterScene) -> None:
         self.scene = scene
@@ -104,7 +104,7 @@ class Trouble:
         self.scene.line.noise(GARBAGE[: self.dice.randrange(40)])
 
     async def foreign(self) -> None:
-        """Somebody's request, to and from nobody."""
+        """Send a request of a unit that is not there."""
         self.scene.line.say(bytes.fromhex("0a0600020082a9d0"))
 
     async def remove_or_add(self) -> None:
@@ -119,10 +119,10 @@ class Trouble:
         await self.scene.master.change_circuit(supply)
 
     async def nothing(self) -> None:
-        """Let it all go on."""
+        """Change nothing."""
 
 
-def test_no_gap_whatever_the_bus_does() -> None:
+def test_no_gap_whatever_happens_on_the_bus() -> None:
     """Dead slaves, commands, requests, noise, boxes that come and go."""
 
     async def scene() -> None:
@@ -144,8 +144,8 @@ def test_no_gap_whatever_the_bus_does() -> None:
     simulate(scene())
 
 
-def test_a_line_that_others_keep_busy() -> None:
-    """A burst longer than the patience for silence: then again at once."""
+def test_a_line_kept_busy_by_others() -> None:
+    """A burst longer than the patience for silence: the broadcast follows at once."""
 
     async def scene() -> None:
         async with MasterScene() as scene:
@@ -159,15 +159,15 @@ def test_a_line_that_others_keep_busy() -> None:
             await asyncio.sleep(3)
             after = [sent for sent in scene.broadcasts() if sent.when > planned]
             assert after[0].when - end < 0.1
-            # The next one is where it was planned.
+            # The next one comes at its planned time.
             assert after[1].when == pytest.approx(planned + PERIOD, abs=SLACK)
             assert max(scene.gaps()) < 5
 
     simulate(scene())
 
 
-def test_a_port_that_is_back_soon() -> None:
-    """The slaves go on: what they charged with they are read back, and told."""
+def test_a_port_lost_for_a_moment() -> None:
+    """The slaves go on with the current that is read back and broadcast again."""
 
     async def scene() -> None:
         async with MasterScene() as scene:
@@ -184,7 +184,7 @@ def test_a_port_that_is_back_soon() -> None:
     simulate(scene())
 
 
-def test_a_port_that_is_lost_for_longer() -> None:
+def test_a_port_lost_for_longer() -> None:
     async def scene() -> None:
         async with MasterScene() as scene:
             await asyncio.sleep(4)
@@ -206,7 +206,7 @@ def test_a_port_that_is_lost_for_longer() -> None:
     simulate(scene())
 
 
-def test_nothing_is_said_where_there_are_no_slaves() -> None:
+def test_nothing_is_sent_without_slaves() -> None:
     async def scene() -> None:
         async with MasterScene(units=()) as scene:
             scene.plug_box(2)
@@ -225,8 +225,8 @@ def test_nothing_is_said_where_there_are_no_slaves() -> None:
     simulate(scene())
 
 
-def test_a_slave_taken_off_while_it_charges_still_counts() -> None:
-    """It goes on with 6 A for as long as it hears us; its own word ends that."""
+def test_a_slave_removed_while_it_charges_still_counts() -> None:
+    """It goes on with 6 A while it receives broadcasts, until a request shows its end."""
 
     async def scene() -> None:
         async with MasterScene() as scene:
@@ -244,8 +244,8 @@ def test_a_slave_taken_off_while_it_charges_still_counts() -> None:
     simulate(scene())
 
 
-def test_a_restart_does_not_disturb_who_charges() -> None:
-    """Killed without a goodbye, and back within what the boxes wait."""
+def test_a_restart_does_not_disturb_charging_slaves() -> None:
+    """The bus ends without a shutdown and is back before the boxes stop."""
 
     async def scene() -> None:
         async with MasterScene() as scene:
@@ -266,7 +266,7 @@ def test_a_restart_does_not_disturb_who_charges() -> None:
     simulate(scene())
 
 
-def test_without_us_all_stop() -> None:
+def test_without_a_master_all_slaves_stop() -> None:
     async def scene() -> None:
         async with MasterScene() as scene:
             await asyncio.sleep(4)

@@ -1,4 +1,4 @@
-"""What comes late on the line of our master: echoes, answers, its own broadcast."""
+"""Late frames under our own master: echoes, answers, its broadcast."""
 
 import asyncio
 from contextlib import suppress
@@ -21,8 +21,8 @@ from tests.evse.smartevse.test_master_requests import ASKS, answers, frame
 from tests.simulated_time import SimulatedLoop, now, simulate
 
 
-def test_late_echoes_of_several_broadcasts_are_no_other_master() -> None:
-    """A network port hands its echo on when we have said something else already."""
+def test_late_echoes_of_several_broadcasts_are_not_taken_for_another_master() -> None:
+    """A network port passes an echo on after the next broadcast has been sent."""
 
     async def scene() -> None:
         async with MasterScene(units=(2,)) as scene:
@@ -54,8 +54,8 @@ async def endless(_turn: Turn) -> None:
     await asyncio.sleep(0.45)
 
 
-def test_a_broadcast_that_is_late_goes_before_what_waited_longer() -> None:
-    """Home Assistant hangs for a moment, and long conversations are under way."""
+def test_a_late_broadcast_goes_before_turns_that_waited_longer() -> None:
+    """The event loop is blocked for a moment while long conversations are under way."""
 
     async def scene() -> None:
         async with MasterScene(units=(2, 3)) as scene:
@@ -74,8 +74,8 @@ def test_a_broadcast_that_is_late_goes_before_what_waited_longer() -> None:
 
 
 @pytest.mark.parametrize("before", [0.1, 0.2, 0.3, 0.5])
-def test_making_room_holds_no_broadcast_up(before: float) -> None:
-    """Those that must make room do not answer: each costs a whole time-out."""
+def test_making_room_delays_no_broadcast(before: float) -> None:
+    """The slaves that must go down do not answer: each costs a whole time-out."""
 
     async def scene() -> None:
         scene = MasterScene(units=(2, 3, 4), limit=32.0, current=32.0, maximum=32)
@@ -98,7 +98,7 @@ def test_making_room_holds_no_broadcast_up(before: float) -> None:
     simulate(scene())
 
 
-def test_beside_another_master_requests_leave_nothing_behind() -> None:
+def test_requests_beside_another_master_leave_no_jobs() -> None:
     async def scene() -> None:
         async with MasterScene(units=(2,)) as scene:
             await asyncio.sleep(6)
@@ -115,7 +115,7 @@ def test_beside_another_master_requests_leave_nothing_behind() -> None:
     ("delay", "jitter"), [(0.1, 0.0), (0.02, 1.0), (0.08, 0.5), (0.02, 3.0)]
 )
 def test_a_slow_network_port(delay: float, jitter: float) -> None:
-    """Both ways have a delay, and now and then one that is longer than a time-out."""
+    """Both directions are delayed, at times by more than a time-out."""
 
     async def scene() -> None:
         dice = Random(3)  # noqa: S311 - the same each time
@@ -158,7 +158,7 @@ def test_a_slow_network_port(delay: float, jitter: float) -> None:
 
 @pytest.mark.parametrize("before", [0.2, 0.4, 0.6])
 def test_an_older_request_is_not_answered_after_a_newer_one(before: float) -> None:
-    """82 to a box that charges by now: it says B, and its contactor stays closed."""
+    """82 to a box that charges by then: it reports B with its contactor closed."""
 
     async def scene() -> None:
         scene = MasterScene(units=(2, 3, 4), limit=32.0, current=32.0, maximum=32)

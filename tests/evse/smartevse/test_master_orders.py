@@ -38,7 +38,7 @@ def test_a_set_point_does_not_wait_for_the_next_broadcast() -> None:
     simulate(scene())
 
 
-def test_a_raise_that_the_supply_limits_is_confirmed_all_the_same() -> None:
+def test_a_raise_above_its_share_is_confirmed_all_the_same() -> None:
     async def scene() -> None:
         async with MasterScene(limit=16.0, current=6.0) as scene:
             await asyncio.sleep(5)
@@ -48,7 +48,7 @@ def test_a_raise_that_the_supply_limits_is_confirmed_all_the_same() -> None:
             await asyncio.sleep(3)
             assert scene.box(2).offers == 10
             assert scene.slave(2).limits.ceiling == 16
-            # What the other leaves is its own at once.
+            # It gets the share of the other as soon as that one has left.
             scene.box(3).car.leave()
             await asyncio.sleep(3)
             assert scene.box(2).offers == 16
@@ -57,7 +57,7 @@ def test_a_raise_that_the_supply_limits_is_confirmed_all_the_same() -> None:
 
 
 @pytest.mark.parametrize("attempt", range(3))
-def test_a_command_whose_broadcast_is_lost_is_said_again(attempt: int) -> None:
+def test_a_command_whose_broadcast_is_lost_is_repeated(attempt: int) -> None:
     async def scene() -> None:
         async with MasterScene(units=(2,)) as scene:
             await asyncio.sleep(5)
@@ -77,7 +77,7 @@ def test_a_command_whose_broadcast_is_lost_is_said_again(attempt: int) -> None:
     simulate(scene())
 
 
-def test_a_box_that_does_not_follow_is_told_of() -> None:
+def test_a_box_that_does_not_follow_is_a_fault() -> None:
     async def scene() -> None:
         async with MasterScene(units=(2,)) as scene:
             await asyncio.sleep(5)
@@ -87,7 +87,7 @@ def test_a_box_that_does_not_follow_is_told_of() -> None:
             with pytest.raises(NotConfirmedError):
                 await scene.slave(2).change_orders(OrderChange(current=8.0))
             assert Fault.LIMIT_NOT_TAKEN in scene.slave(2).faults
-            # The lowering stands, and is heard as soon as it can be.
+            # The lowering stands, and takes effect as soon as it is received.
             scene.box(2).misses = lambda _data: False
             await asyncio.sleep(5)
             assert scene.offers == 8
@@ -96,8 +96,8 @@ def test_a_box_that_does_not_follow_is_told_of() -> None:
     simulate(scene())
 
 
-def test_a_box_that_stays_above_its_share_is_told_of() -> None:
-    """Without any command: its share fell, and it does not hear so."""
+def test_a_box_that_stays_above_its_share_is_a_fault() -> None:
+    """Without any command: its share fell, and it misses the broadcasts."""
 
     async def scene() -> None:
         async with MasterScene(limit=32.0, watch=False) as scene:
@@ -109,7 +109,7 @@ def test_a_box_that_stays_above_its_share_is_told_of() -> None:
             await scene.master.change_circuit(Circuit(limit=10.0))
             await asyncio.sleep(5)
             assert Fault.LIMIT_NOT_TAKEN in scene.slave(2).faults
-            # Said again with each reading that shows it, beside the regular ones.
+            # Repeated after each reading above its share, beside the regular ones.
             assert len(scene.broadcasts(begin)) >= 5
             scene.box(2).misses = lambda _data: False
             # The next broadcast, and the reading after it.
@@ -132,7 +132,7 @@ def test_off_is_the_access_bit_and_not_a_broadcast_of_0() -> None:
             assert scene.frames(OFF) == [STOP]
             assert slave.reading is not None
             assert slave.reading.allowed is False
-            # No limit starts it again.
+            # A limit does not start it again.
             for current in (10.0, 0.0, 16.0):
                 await slave.change_orders(OrderChange(current=current))
             await asyncio.sleep(200)
@@ -197,7 +197,7 @@ def test_a_box_closed_at_the_box_stays_closed() -> None:
     simulate(scene())
 
 
-def test_0_a_is_a_pause_of_ours_and_ends_with_the_limit() -> None:
+def test_a_pause_by_a_limit_of_0_a_ends_with_that_limit() -> None:
     async def scene() -> None:
         async with MasterScene(units=(2,)) as scene:
             await asyncio.sleep(5)
@@ -212,7 +212,7 @@ def test_0_a_is_a_pause_of_ours_and_ends_with_the_limit() -> None:
             await asyncio.sleep(5)
             assert scene.frames("021000a7") == [STOP, START]
             assert scene.offers == 10
-            # But not what the user has turned off meanwhile.
+            # But not a pause by the user in between.
             await slave.change_orders(OrderChange(current=0.0))
             await slave.change_orders(OrderChange(allowed=False))
             await slave.change_orders(OrderChange(current=10.0))
@@ -222,7 +222,7 @@ def test_0_a_is_a_pause_of_ours_and_ends_with_the_limit() -> None:
     simulate(scene())
 
 
-def test_the_last_come_is_stopped_where_the_supply_does_not_suffice() -> None:
+def test_the_last_to_begin_is_stopped_when_the_circuit_limit_falls() -> None:
     async def scene() -> None:
         async with MasterScene(units=(2, 3, 4), limit=18.0) as scene:
             await asyncio.sleep(5)
@@ -235,23 +235,23 @@ def test_the_last_come_is_stopped_where_the_supply_does_not_suffice() -> None:
             lowered = now()
             await asyncio.sleep(0.6)
             assert scene.box(4).state == "A"
-            # No more than the lowest, as long as the third one had not stopped.
+            # The others had no more than the lowest until the third one had stopped.
             assert 12 <= scene.offers <= 13
             scene.overshoot = 0.0
             await asyncio.sleep(3)
             assert scene.offers == 13
-            # It is not out of service: it waits for us.
+            # It is not out of service: it waits for current.
             waiting = scene.slave(4)
             assert waiting.waits_for_current
             assert waiting.reading is not None
             assert waiting.reading.connectors[1].status is Status.SUSPENDED_EVSE
-            # Room at once, but it does not flap.
+            # There is room at once, but it does not start and stop all the time.
             await scene.master.change_circuit(Circuit(limit=18.0))
             back = await scene.until(lambda: scene.box(4).state == "C", 100)
             assert now() - lowered >= WITHHELD_FOR
             assert back < WITHHELD_FOR + 10
             assert scene.offers == 18
-            # The user's word is not ours to give back.
+            # A pause by the user is not restored.
             await scene.master.change_circuit(Circuit(limit=13.0))
             await asyncio.sleep(2)
             scene.overshoot = 0.0
@@ -264,8 +264,8 @@ def test_the_last_come_is_stopped_where_the_supply_does_not_suffice() -> None:
     simulate(scene())
 
 
-def test_not_before_all_is_known_does_anybody_go_up() -> None:
-    """One of three does not answer: for 12 s it may do what it did before."""
+def test_no_slave_goes_up_before_all_are_known() -> None:
+    """One of two does not answer: for 12 s it may still charge as before."""
 
     async def scene() -> None:
         async with MasterScene(limit=20.0) as scene:
@@ -286,7 +286,7 @@ def test_not_before_all_is_known_does_anybody_go_up() -> None:
     simulate(scene())
 
 
-def test_a_slave_that_falls_silent_may_still_hear() -> None:
+def test_a_slave_that_falls_silent_may_still_receive() -> None:
     async def scene() -> None:
         async with MasterScene(limit=20.0) as scene:
             await asyncio.sleep(5)
@@ -304,7 +304,7 @@ def test_a_slave_that_falls_silent_may_still_hear() -> None:
     simulate(scene())
 
 
-def test_only_what_a_slave_follows_can_be_set_in_it() -> None:
+def test_only_settings_that_a_slave_follows_can_be_set() -> None:
     async def scene() -> None:
         async with MasterScene(units=(2,)) as scene:
             await asyncio.sleep(5)
@@ -317,7 +317,7 @@ def test_only_what_a_slave_follows_can_be_set_in_it() -> None:
     simulate(scene())
 
 
-def test_one_goes_up_as_soon_as_the_other_has_confirmed_that_it_went_down() -> None:
+def test_one_goes_up_as_soon_as_the_other_has_confirmed_to_be_down() -> None:
     async def scene() -> None:
         async with MasterScene(units=(2, 3), limit=20.0) as scene:
             await asyncio.sleep(5)
@@ -329,7 +329,7 @@ def test_one_goes_up_as_soon_as_the_other_has_confirmed_that_it_went_down() -> N
                 await asyncio.sleep(wait)
                 await scene.slave(3).change_orders(OrderChange(current=10.0))
                 took = await scene.until(lambda: scene.box(3).offers == 10)
-                # No poll is waited for, at most the broadcast that is due.
+                # It waits for no poll, at most for the broadcast that is due.
                 assert took < 0.8
                 await scene.slave(3).change_orders(OrderChange(current=6.0))
                 await scene.until(lambda: scene.box(2).offers == 14)

@@ -22,19 +22,19 @@ async def scan(bus: Bus, scene: MasterScene) -> ScanResult:
     return await MASTER.scan(bus, config, orders, lambda _share: None)
 
 
-def test_another_master_is_heard_before_our_first_word() -> None:
+def test_another_master_is_noticed_before_our_first_broadcast() -> None:
     async def scene() -> None:
         async with MasterScene() as scene:
-            told: list[frozenset[Fault]] = []
-            scene.master.subscribe(lambda: told.append(scene.master.noticed))
+            changes: list[frozenset[Fault]] = []
+            scene.master.subscribe(lambda: changes.append(scene.master.noticed))
             await asyncio.sleep(2.3)
             scene.line.say(FOREIGN)
             await asyncio.sleep(STAY_SILENT - 1)
             assert scene.line.sent == []
-            assert told == [frozenset({Fault.SECOND_MASTER})]
+            assert changes == [frozenset({Fault.SECOND_MASTER})]
             await asyncio.sleep(5)
             assert scene.broadcasts()
-            assert told[-1] == frozenset()
+            assert changes[-1] == frozenset()
 
     simulate(scene())
 
@@ -47,7 +47,7 @@ def test_another_master_is_heard_before_our_first_word() -> None:
         "0910002000081000640000000000000000000000000000",
     ],
 )
-def test_another_master_silences_us_at_once_and_for_good(frame: str) -> None:
+def test_another_master_silences_us_at_once_for_as_long_as_it_sends(frame: str) -> None:
     async def scene() -> None:
         async with MasterScene() as scene:
             await asyncio.sleep(6)
@@ -63,31 +63,31 @@ def test_another_master_silences_us_at_once_and_for_good(frame: str) -> None:
             for _ in range(50):
                 await asyncio.sleep(2)
                 scene.line.say(data)
-            heard = now() - 100
+            first = now() - 100
             with pytest.raises(NotAvailableError, match="another master"):
                 await waiting
             with pytest.raises(NotAvailableError, match="another master"):
                 await scene.slave(2).change_orders(OrderChange(allowed=False))
-            late = [s for s in scene.line.sent if s.when > heard + 0.02]
+            late = [s for s in scene.line.sent if s.when > first + 0.02]
             assert late == []
             assert scene.master.noticed == {Fault.SECOND_MASTER}
             assert not scene.slave(2).available
-            # Requests of the slaves are its business, too.
+            # It answers the requests of the slaves, too.
             scene.line.say(bytes.fromhex("020600030082f998"))
             await asyncio.sleep(STAY_SILENT - 5)
-            assert [s for s in scene.line.sent if s.when > heard + 0.02] == []
+            assert [s for s in scene.line.sent if s.when > first + 0.02] == []
             await asyncio.sleep(10)
             assert scene.master.noticed == frozenset()
             assert scene.slave(2).available
-            # The lowering was said, and stands.
+            # The lowering stands.
             assert scene.slave(2).orders.limit.current == 9
 
     simulate(scene())
 
 
 @pytest.mark.parametrize("late", [0.02, 0.3])
-def test_our_own_echo_is_no_other_master(late: float) -> None:
-    """An adapter that hears itself, also one that hands its echo on late."""
+def test_our_own_echo_is_not_taken_for_another_master(late: float) -> None:
+    """An adapter with an echo, also one that passes it on late."""
 
     async def scene() -> None:
         async with MasterScene(units=(2,)) as scene:
@@ -114,13 +114,13 @@ def test_our_own_echo_is_no_other_master(late: float) -> None:
     "frame",
     [
         "001000010004",  # the answer to a broadcast, of a box without load balancing
-        "040600030082",  # a slave that is not set up
-        "020600830050",  # somebody's acknowledgement
+        "040600030082",  # a slave that is not configured
+        "020600830050",  # an acknowledgement
         "0a0400000028",
         "000600020001",
     ],
 )
-def test_other_frames_are_no_master(frame: str) -> None:
+def test_other_frames_are_not_taken_for_a_master(frame: str) -> None:
     async def scene() -> None:
         async with MasterScene() as scene:
             await asyncio.sleep(6)
@@ -146,7 +146,7 @@ def test_another_dialect_is_not_written_to(dialect: str) -> None:
             with pytest.raises(NotAvailableError, match="firmware"):
                 await slave.change_orders(OrderChange(current=10.0))
             assert {s.data[1] for s in scene.line.sent if s.data[0] == 3} <= {3, 4}
-            # It takes nothing of the supply, and has no word.
+            # It has no share, and its value is 0.
             assert {s.words[2] for s in scene.broadcasts()} == {0}
             await scene.charge(2)
             await asyncio.sleep(3)
@@ -155,7 +155,7 @@ def test_another_dialect_is_not_written_to(dialect: str) -> None:
     simulate(scene())
 
 
-def test_the_scan_only_reads_and_says_what_cannot_be_used() -> None:
+def test_a_scan_only_reads_and_reports_unsupported_boxes() -> None:
     async def scene() -> None:
         async with MasterScene(units=()) as scene:
             scene.plug_box(2)
@@ -172,7 +172,7 @@ def test_the_scan_only_reads_and_says_what_cannot_be_used() -> None:
     simulate(scene())
 
 
-def test_the_scan_beside_another_master_says_so_and_nothing_else() -> None:
+def test_a_scan_beside_another_master_sends_nothing_and_reports_it() -> None:
     async def scene() -> None:
         async with MasterScene(units=()) as scene:
             scene.plug_box(2)
@@ -186,7 +186,7 @@ def test_the_scan_beside_another_master_says_so_and_nothing_else() -> None:
     simulate(scene())
 
 
-def test_a_scan_of_a_running_bus_holds_no_broadcast_up() -> None:
+def test_a_scan_of_a_running_bus_delays_no_broadcast() -> None:
     async def scene() -> None:
         async with MasterScene(units=(2,)) as scene:
             scene.plug_box(3)
@@ -200,7 +200,7 @@ def test_a_scan_of_a_running_bus_holds_no_broadcast_up() -> None:
 
 
 @pytest.mark.parametrize(
-    "supply",
+    "circuit",
     [
         Circuit(limit=float("nan")),
         Circuit(limit=-1.0),
@@ -209,9 +209,9 @@ def test_a_scan_of_a_running_bus_holds_no_broadcast_up() -> None:
         Circuit(limit=16, minimum=float("inf")),
     ],
 )
-def test_a_supply_that_cannot_be_is_refused(supply: Circuit) -> None:
+def test_an_impossible_circuit_is_refused(circuit: Circuit) -> None:
     with pytest.raises(RefusedOrderError):
-        Master(supply)
+        Master(circuit)
 
 
 def crc(data: bytes) -> bytes:

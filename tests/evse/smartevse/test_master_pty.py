@@ -1,4 +1,4 @@
-"""Our master and virtual slaves on a real pty: the supply, and our silence."""
+"""Our master and virtual slaves on a real pty: sharing, and falling silent."""
 
 import asyncio
 from itertools import pairwise
@@ -23,15 +23,15 @@ pytestmark = pytest.mark.real_time
 PATIENCE = 20.0
 
 
-class Witness(Device):
-    """Sees at each step what all boxes offer with closed contactors."""
+class OfferMeter(Device):
+    """Adds up at each step the offers of all boxes with closed contactors."""
 
     baud: ClassVar[int] = 9600
     parity: ClassVar[str] = "N"
     protocol: ClassVar[str] = "smartevse"
 
     def __init__(self, *boxes: SmartEvse) -> None:
-        super().__init__("witness")
+        super().__init__("meter")
         self.boxes = boxes
         self.most = 0.0
         self.opened_at: float | None = None
@@ -73,16 +73,16 @@ def car_of(box: SmartEvse) -> Car:
 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """There is no other master here: no need to listen for it for so long."""
+    """Shorten the time to listen for another master: there is none."""
     monkeypatch.setattr(master, "LISTENING", 0.3)
 
 
 @pytest.mark.usefixtures("impatient")
 async def test_two_cars_share_16_a() -> None:
-    """One after the other, up and down; the contactors and pilots are the witness."""
+    """One after the other, up and down; the contactors and pilots are the oracle."""
     boxes = make_box(2), make_box(3)
-    witness = Witness(*boxes)
-    async with VirtualBus.pty(*boxes, witness) as virtual:
+    meter = OfferMeter(*boxes)
+    async with VirtualBus.pty(*boxes, meter) as virtual:
         bus = MASTER.bus(virtual.url, circuit=Circuit(limit=16.0))
         put_on(bus, 2, 3)
         async with bus:
@@ -112,24 +112,24 @@ async def test_two_cars_share_16_a() -> None:
             await virtual.wait_for_async(
                 lambda: boxes[0].pilot_current == 16, timeout=PATIENCE
             )
-        assert witness.most == 16
+        assert meter.most == 16
         assert max(box.controller.dropped for box in boxes) == 0
         beats = [r.t for r in smartevse_requests_in(virtual) if r.unit == 0]
         assert max(b - a for a, b in pairwise(beats)) < 2.2
 
 
 @pytest.mark.usefixtures("impatient")
-async def test_killed_without_a_goodbye_the_slaves_stop_by_themselves() -> None:
+async def test_without_a_shutdown_the_slaves_stop_by_themselves() -> None:
     box = make_box(2)
-    witness = Witness(box)
-    async with VirtualBus.pty(box, witness) as virtual:
+    meter = OfferMeter(box)
+    async with VirtualBus.pty(box, meter) as virtual:
         bus = MASTER.bus(virtual.url, circuit=Circuit(limit=16.0))
         put_on(bus, 2)
         await bus.start()
         await bus.chargers["2"].wait_available()
         car_of(box).plug_in()
         await virtual.wait_for_async(lambda: box.contactor, timeout=PATIENCE)
-        # Nobody waits for anything, nothing is closed: the task is just gone.
+        # Nothing is awaited or closed: the task is just gone.
         task = bus._task
         assert task is not None
         task.cancel()
@@ -137,18 +137,18 @@ async def test_killed_without_a_goodbye_the_slaves_stop_by_themselves() -> None:
         last = box.broadcasts[-1].t
         virtual.time_scale = 20
         await virtual.wait_for_async(lambda: not box.contactor, timeout=PATIENCE)
-        assert witness.opened_at is not None
-        assert 9 <= witness.opened_at - last <= 11.5
+        assert meter.opened_at is not None
+        assert 9 <= meter.opened_at - last <= 11.5
         assert box.error & 2
         virtual.time_scale = 1
         await bus.stop()
 
 
 @pytest.mark.usefixtures("impatient")
-async def test_stopped_and_started_again_who_charges_goes_on() -> None:
+async def test_a_restarted_bus_does_not_disturb_a_charge() -> None:
     box = make_box(2)
-    witness = Witness(box)
-    async with VirtualBus.pty(box, witness) as virtual:
+    meter = OfferMeter(box)
+    async with VirtualBus.pty(box, meter) as virtual:
         bus = MASTER.bus(virtual.url, circuit=Circuit(limit=16.0))
         put_on(bus, 2)
         async with bus:
@@ -157,21 +157,21 @@ async def test_stopped_and_started_again_who_charges_goes_on() -> None:
             await virtual.wait_for_async(
                 lambda: box.contactor and box.pilot_current == 16, timeout=PATIENCE
             )
-        heard = len(box.broadcasts)
+        before = len(box.broadcasts)
         bus = MASTER.bus(virtual.url, circuit=Circuit(limit=16.0))
         put_on(bus, 2)
         async with bus:
             await virtual.wait_for_async(
-                lambda: len(box.broadcasts) >= heard + 2, timeout=PATIENCE
+                lambda: len(box.broadcasts) >= before + 2, timeout=PATIENCE
             )
-            assert {sent.currents[1] for sent in box.broadcasts[heard:]} == {160}
+            assert {sent.currents[1] for sent in box.broadcasts[before:]} == {160}
             assert box.contactor
-            assert witness.opened_at is None
+            assert meter.opened_at is None
             assert len(box.requests_sent) == 2
 
 
 @pytest.mark.usefixtures("impatient")
-async def test_the_scan_finds_slaves_and_says_nothing_else() -> None:
+async def test_a_scan_finds_slaves_and_only_reads() -> None:
     boxes = make_box(2), make_box(4)
     async with (
         VirtualBus.pty(*boxes) as virtual,
@@ -185,7 +185,7 @@ async def test_the_scan_finds_slaves_and_says_nothing_else() -> None:
         assert not boxes[0].broadcasts
 
 
-async def test_a_box_that_is_master_itself_silences_us() -> None:
+async def test_a_box_that_is_a_master_silences_us() -> None:
     boxes = SmartEvse("2.17", load_balance=1), make_box(2)
     async with VirtualBus.pty(*boxes) as virtual:
         bus = MASTER.bus(virtual.url, circuit=Circuit(limit=16.0))

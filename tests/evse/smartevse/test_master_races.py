@@ -1,4 +1,4 @@
-"""What is said at the box, or by us, while something else is on its way."""
+"""Commands at the box, or ours, that cross another frame on the line."""
 
 import asyncio
 from contextlib import suppress
@@ -19,8 +19,8 @@ ACCESS = b"\x10\x00\xa7"
 START = "021000a70001020001"
 
 
-def test_who_does_not_hear_its_stop_is_granted_current_again_later() -> None:
-    """Stopped for want of supply, it left before it heard so: nothing to give back."""
+def test_a_slave_that_misses_its_stop_is_granted_current_again_later() -> None:
+    """Withheld for lack of current, its car left before the stop: nothing to restore."""
 
     async def scene() -> None:
         async with MasterScene(units=(2,), watch=False) as scene:
@@ -45,8 +45,8 @@ def test_who_does_not_hear_its_stop_is_granted_current_again_later() -> None:
 
 
 @pytest.mark.parametrize("waits", ["F", "G"])
-def test_a_no_at_the_box_that_crosses_our_answer_counts(waits: str) -> None:
-    """82 and 83 take a box to B and to C in whatever state it is, access or not."""
+def test_access_turned_off_at_the_box_while_our_answer_is_sent(waits: str) -> None:
+    """82 and 83 take a box to B and to C from any state, with access or without."""
 
     async def scene() -> None:
         async with MasterScene(units=(2,)) as scene:
@@ -70,7 +70,7 @@ def test_a_no_at_the_box_that_crosses_our_answer_counts(waits: str) -> None:
     simulate(scene())
 
 
-def test_a_request_from_before_a_no_at_the_box_is_not_granted() -> None:
+def test_a_request_older_than_access_turned_off_at_the_box() -> None:
     async def scene() -> None:
         async with MasterScene(units=(2,)) as scene:
             await asyncio.sleep(5)
@@ -85,9 +85,9 @@ def test_a_request_from_before_a_no_at_the_box_is_not_granted() -> None:
     simulate(scene())
 
 
-@pytest.mark.parametrize("want", ["supply", "limit"])
-def test_a_no_at_the_box_right_before_our_own_stop_stays(want: str) -> None:
-    """It was not read yet: what we stop then is not ours to give back."""
+@pytest.mark.parametrize("cause", ["circuit", "limit"])
+def test_access_turned_off_at_the_box_right_before_our_own_stop(cause: str) -> None:
+    """It was not read yet: access is not ours to restore."""
 
     async def scene() -> None:
         async with MasterScene(units=(2,), watch=False) as scene:
@@ -95,7 +95,7 @@ def test_a_no_at_the_box_right_before_our_own_stop_stays(want: str) -> None:
             await scene.charge(2)
             await scene.until(lambda: scene.slave(2).slot.ready - now() > 1.9)
             scene.box(2).controller.outlet.set_access(False)
-            if want == "supply":
+            if cause == "circuit":
                 await scene.master.change_circuit(Circuit(limit=5.0))
                 await asyncio.sleep(3)
                 await scene.master.change_circuit(Circuit(limit=16.0))
@@ -109,7 +109,7 @@ def test_a_no_at_the_box_right_before_our_own_stop_stays(want: str) -> None:
     simulate(scene())
 
 
-def test_a_yes_at_the_box_costs_a_second_and_not_a_minute() -> None:
+def test_access_turned_on_at_the_box_counts_at_the_next_request() -> None:
     async def scene() -> None:
         async with MasterScene(units=(2,)) as scene:
             await asyncio.sleep(5)
@@ -123,8 +123,8 @@ def test_a_yes_at_the_box_costs_a_second_and_not_a_minute() -> None:
     simulate(scene())
 
 
-def test_nothing_is_granted_to_a_box_that_was_stopped_for_want_of_supply() -> None:
-    """There is room again, but its minute is not over: somebody opens it at the box."""
+def test_nothing_is_granted_to_a_box_withheld_for_lack_of_current() -> None:
+    """There is room, but its minute is not over: access is turned on at the box."""
 
     async def scene() -> None:
         async with MasterScene(units=(2,), watch=False) as scene:
@@ -146,8 +146,8 @@ def test_nothing_is_granted_to_a_box_that_was_stopped_for_want_of_supply() -> No
     simulate(scene())
 
 
-def test_after_a_restart_nothing_is_given_back() -> None:
-    """Who stopped it is not remembered: it may have been somebody at the box."""
+def test_after_a_restart_nothing_is_restored() -> None:
+    """It is not known who stopped it: access may have been turned off at the box."""
 
     async def scene() -> None:
         async with MasterScene(units=(2,), watch=False) as scene:
@@ -168,8 +168,8 @@ def test_after_a_restart_nothing_is_given_back() -> None:
     simulate(scene())
 
 
-def test_a_box_that_does_not_stop_is_told_of() -> None:
-    """Nobody has ordered it: it is the supply that does not suffice."""
+def test_a_box_that_does_not_stop_is_a_fault() -> None:
+    """No order stops it: the circuit limit does not suffice."""
 
     async def scene() -> None:
         async with MasterScene(units=(2,), watch=False) as scene:
@@ -191,7 +191,7 @@ def test_a_box_that_does_not_stop_is_told_of() -> None:
 
 
 def test_an_off_is_not_overtaken_by_the_start_before_it() -> None:
-    """The start is not heard, and would be said again after the off."""
+    """The start is not received, and would be repeated after the off."""
 
     async def scene() -> None:
         async with MasterScene(units=(2,), allowed=False) as scene:
@@ -216,7 +216,7 @@ def test_an_off_is_not_overtaken_by_the_start_before_it() -> None:
 
 
 def test_a_limit_is_not_overtaken_by_the_stop_before_it() -> None:
-    """0 A is not heard, and would be said again after the limit that follows."""
+    """0 A is not received, and would be repeated after the limit that follows."""
 
     async def scene() -> None:
         async with MasterScene(units=(2,)) as scene:

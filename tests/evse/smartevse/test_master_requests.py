@@ -1,4 +1,4 @@
-"""What slaves ask for, and what they are answered: in time, or not at all."""
+"""Requests of slaves, and their answers: in time, or not at all."""
 
 import asyncio
 
@@ -27,11 +27,11 @@ PLUGGED = bytes.fromhex("020600020082a858")
 ASKS = bytes.fromhex("020600030082f998")
 LEFT = frame("020600010000")
 ENDED = frame("020600040000")
-NOT_ASKED = "02060084"
+TO_STATE_B = "02060084"
 
 
 def answers(scene: MasterScene, since: float = 0.0) -> list[Sent]:
-    """Acknowledgements to anybody."""
+    """Return the answers to requests of all units."""
     return [
         sent
         for sent in scene.line.sent
@@ -56,7 +56,7 @@ def test_answered_in_time_also_right_before_a_broadcast(before: float) -> None:
     simulate(scene())
 
 
-def test_answered_in_time_in_the_midst_of_a_time_out() -> None:
+def test_answered_in_time_during_a_time_out() -> None:
     async def scene() -> None:
         async with MasterScene(units=(2, 3)) as scene:
             await asyncio.sleep(6)
@@ -89,17 +89,17 @@ def test_a_repeated_request_has_one_answer_each() -> None:
     simulate(scene())
 
 
-def test_state_b_is_acknowledged_only_when_asked_for() -> None:
+def test_state_b_is_acknowledged_only_when_requested() -> None:
     async def scene() -> None:
         async with MasterScene(units=(2,)) as scene:
             await asyncio.sleep(5)
             await scene.charge(2)
             await asyncio.sleep(5)
-            assert scene.frames(NOT_ASKED) == []
+            assert scene.frames(TO_STATE_B) == []
             ended = now()
             scene.box(2).car.finish()
             await asyncio.sleep(3)
-            assert scene.frames(NOT_ASKED, ended) == [frame("020600840000").hex()]
+            assert scene.frames(TO_STATE_B, ended) == [frame("020600840000").hex()]
             assert scene.box(2).state == "B"
 
     simulate(scene())
@@ -111,7 +111,7 @@ def test_state_b_is_acknowledged_only_when_asked_for() -> None:
     ids=["off", "0 A"],
 )
 def test_nothing_is_granted_to_a_box_that_may_not_charge(stops: OrderChange) -> None:
-    """Somebody has opened its access at the box: it asks, and gets nothing."""
+    """Access was turned on at the box: its request is granted 0 A."""
 
     async def scene() -> None:
         async with MasterScene(units=(2,)) as scene:
@@ -131,7 +131,7 @@ def test_nothing_is_granted_to_a_box_that_may_not_charge(stops: OrderChange) -> 
     simulate(scene())
 
 
-def test_nothing_is_granted_where_the_supply_is_used_up() -> None:
+def test_nothing_is_granted_when_the_circuit_limit_is_used_up() -> None:
     async def scene() -> None:
         async with MasterScene(limit=10.0) as scene:
             await asyncio.sleep(5)
@@ -156,7 +156,7 @@ def test_room_is_made_first_and_well_within_the_second() -> None:
             assert scene.box(2).offers == 16
             scene.box(3).car.plug_in(request=False)
             await scene.until(lambda: scene.box(3).state == "B")
-            # What was promised to it has been given back meanwhile.
+            # Its reservation has ended meanwhile.
             await scene.until(lambda: scene.box(2).offers == 16)
             asked = now()
             scene.box(3).car.request()
@@ -173,15 +173,15 @@ def test_room_is_made_first_and_well_within_the_second() -> None:
                 "020400a0",
                 "03060083",
             ]
-            # The lowest at first: it was told nothing as long as it drew nothing.
+            # The lowest at first: its value was 0 as long as it drew nothing.
             assert sent[lowered + 2].data[4:6] == (60).to_bytes(2, "big")
             await scene.until(lambda: scene.box(3).offers == 8, 5)
 
     simulate(scene())
 
 
-def test_room_that_is_not_confirmed_is_not_granted() -> None:
-    """The other misses each broadcast from now on: it goes on with what it has."""
+def test_current_that_is_not_confirmed_to_be_free_is_not_granted() -> None:
+    """The other misses each broadcast from now on: it does not go down."""
 
     async def scene() -> None:
         async with MasterScene() as scene:
@@ -198,7 +198,7 @@ def test_room_that_is_not_confirmed_is_not_granted() -> None:
     simulate(scene())
 
 
-def test_a_maximum_told_with_a_request_limits_it() -> None:
+def test_the_maximum_in_a_request_limits_its_share() -> None:
     async def scene() -> None:
         async with MasterScene(units=(2,), maximum=13) as scene:
             await asyncio.sleep(5)
@@ -206,7 +206,7 @@ def test_a_maximum_told_with_a_request_limits_it() -> None:
             await asyncio.sleep(3)
             assert scene.slave(2).limits.reported == 13
             assert scene.offers == 13
-            # A cable that carries less, with a car that comes with it.
+            # Another car, with a cable that carries less.
             scene.line.say(frame("02060003005a"))
             await asyncio.sleep(3)
             assert scene.broadcasts()[-1].words == (0, 90, 0, 0)
@@ -222,7 +222,7 @@ def test_a_box_that_was_not_read_is_not_answered() -> None:
             scene.line.say(ASKS)
             await asyncio.sleep(2)
             assert answers(scene) == []
-            # Nor is one that is not set up.
+            # Nor is one that is not configured.
             scene.line.say(frame("040600030082"))
             await asyncio.sleep(2)
             assert answers(scene) == []
@@ -230,8 +230,8 @@ def test_a_box_that_was_not_read_is_not_answered() -> None:
     simulate(scene())
 
 
-def test_a_late_answer_is_none() -> None:
-    """Others keep talking: after 1 s the box asks again, and a late word would count."""
+def test_no_answer_is_sent_too_late() -> None:
+    """The line is busy: after 1 s the box repeats, and a late answer would count."""
 
     async def scene() -> None:
         async with MasterScene(units=(2,)) as scene:

@@ -1,7 +1,7 @@
 """Our master against the bytes recorded from the maker's firmware, as a slave.
 
-The slave here is the recording: it says what was recorded, and what we say must be
-what its master said in the same situation, byte for byte.
+The slave here is the recording, and our frames must be those of its master in the same
+situation, byte for byte.
 """
 
 import asyncio
@@ -27,7 +27,7 @@ SETTINGS = {
 
 
 class Recording(Ether):
-    """Answers as recorded."""
+    """A line with the recorded slave."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -58,15 +58,15 @@ def scene_with(status: str, current: float) -> tuple[MasterScene, Recording]:
     return scene, line
 
 
-def said(scene: MasterScene, since: float) -> list[str]:
-    """Return what we said but for settings read, repetitions of one thing once."""
+def sent(scene: MasterScene, since: float) -> list[str]:
+    """Return our frames, repeated ones once, without reads of settings."""
     frames = [sent.data.hex() for sent in scene.line.sent if sent.when >= since]
     spoken = [one for one in frames if one != READ and one[:12] not in SETTINGS]
     return [frame for frame, _ in groupby(spoken)]
 
 
 def recorded(section: str, begin: float, end: float) -> list[str]:
-    """Return what the recorded master said, repetitions of one thing once."""
+    """Return the frames of the recorded master, repeated ones once."""
     frames = [
         entry["hex"]
         for entry in TRACE[section]
@@ -76,7 +76,7 @@ def recorded(section: str, begin: float, end: float) -> list[str]:
 
 
 def play(section: str, begin: float, end: float, current: float) -> list[str]:
-    """Let the recorded slave meet our master; return what ours said."""
+    """Let the recorded slave meet our master; return the frames of ours."""
     entries = [one for one in TRACE[section] if begin <= one["t"] < end]
     statuses = [one for one in entries if one.get("hex", "").startswith("020412")]
 
@@ -93,12 +93,12 @@ def play(section: str, begin: float, end: float, current: float) -> list[str]:
                     line.say(bytes.fromhex(entry["hex"]))
                 elif entry.get("event", "").startswith("limit"):
                     limit = int(entry["event"].split()[1]) / 10
-                    # What is read back comes with the recording, later.
+                    # The read-back is part of the recording, later.
                     change = OrderChange(current=limit)
-                    wish = asyncio.create_task(scene.slave(2).change_orders(change))
-                    wish.add_done_callback(lambda done: done.exception())
+                    order = asyncio.create_task(scene.slave(2).change_orders(change))
+                    order.add_done_callback(lambda done: done.exception())
             await asyncio.sleep(max(0.0, origin + end - now()))
-            return said(scene, origin)
+            return sent(scene, origin)
 
     return simulate(scene())
 
@@ -143,12 +143,12 @@ def test_stop_and_resume_are_those_of_the_recording() -> None:
             await scene.until(scene.broadcasts)
 
             async def asks(what: str, then: str) -> None:
-                sent, answer = by_what[what]
+                request, answer = by_what[what]
                 begin = now()
-                line.say(bytes.fromhex(sent["slave_sent"]))
+                line.say(bytes.fromhex(request["slave_sent"]))
                 line.status = status(then)
                 await asyncio.sleep(3)
-                answers = [f for f in said(scene, begin) if f.startswith("0206")]
+                answers = [f for f in sent(scene, begin) if f.startswith("0206")]
                 assert answers == [answer["master_ack"]], what
 
             await asks("plugged", "state B")
@@ -166,10 +166,10 @@ def test_stop_and_resume_are_those_of_the_recording() -> None:
             stopping = asyncio.create_task(
                 slave.change_orders(OrderChange(allowed=False))
             )
-            await scene.until(lambda: stop["request"] in said(scene, begin))
+            await scene.until(lambda: stop["request"] in sent(scene, begin))
             stopped()
             await stopping
-            writes = [f for f in said(scene, begin) if f.startswith("0210")]
+            writes = [f for f in sent(scene, begin) if f.startswith("0210")]
             assert writes == [stop["request"]]
             line.status = status("4 s later")
             await asyncio.sleep(4)
@@ -180,7 +180,7 @@ def test_stop_and_resume_are_those_of_the_recording() -> None:
             line.answers = {start["request"]: start["reply"]}
             line.status = status("3 s later, pilot still 6 V")
             await slave.change_orders(OrderChange(allowed=True))
-            writes = [f for f in said(scene, begin) if f.startswith("0210")]
+            writes = [f for f in sent(scene, begin) if f.startswith("0210")]
             assert writes == [start["request"]]
             await asyncio.sleep(3)
             await asks("pilot 9 V", "pilot back to 9 V")

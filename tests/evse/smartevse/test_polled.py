@@ -1,4 +1,4 @@
-"""A polled SmartEVSE in all dialects: what it is told, and what is believed."""
+"""A polled SmartEVSE in all dialects: orders, readings, and their checks."""
 
 import asyncio
 
@@ -75,8 +75,8 @@ def test_a_car_charges_within_the_order(dialect: Dialect) -> None:
 
 
 @each
-def test_before_a_car_comes_it_is_told_6_a(dialect: Dialect) -> None:
-    """The cable that comes is not known, and the override beats its coding."""
+def test_the_override_is_6_a_before_a_car_comes(dialect: Dialect) -> None:
+    """The next cable is not known, and the override takes precedence over its coding."""
 
     async def acts(scene: PolledScene) -> None:
         await scene.polled(1)
@@ -92,7 +92,7 @@ def test_before_a_car_comes_it_is_told_6_a(dialect: Dialect) -> None:
 
 @each
 @pytest.mark.parametrize("amperes", [7.3, 12.0])
-def test_a_limit_is_read_back_before_it_is_believed(
+def test_a_limit_is_confirmed_by_its_read_back(
     dialect: Dialect, amperes: float
 ) -> None:
     async def acts(scene: PolledScene) -> None:
@@ -113,11 +113,11 @@ def test_off_is_off_and_stays_so(dialect: Dialect) -> None:
         await scene.charge()
         began = now()
         await scene.charger.change_orders(OrderChange(allowed=False))
-        # A pause waits for no quiet.
+        # A pause does not wait for the quiet time.
         assert now() - began < 0.5
         assert not scene.outlet.access
         await scene.until(lambda: not scene.box.controller.outlet.contactor, 7)
-        # A limit starts nobody's car.
+        # A limit starts no charge.
         await scene.charger.change_orders(OrderChange(current=16))
         await scene.polled(3)
         assert scene.box.offers == 0
@@ -143,7 +143,7 @@ def test_without_access_an_older_box_hides_the_car(dialect: Dialect) -> None:
     play(PolledScene(dialect), acts)
 
 
-def test_without_access_a_later_box_still_tells_of_the_car() -> None:
+def test_without_access_a_later_box_still_reports_the_car() -> None:
     async def acts(scene: PolledScene) -> None:
         await scene.charge()
         await scene.charger.change_orders(OrderChange(allowed=False))
@@ -174,7 +174,7 @@ def test_on_again(dialect: Dialect) -> None:
 
 
 @each
-def test_a_limit_of_0_a_is_a_pause_that_a_limit_ends(dialect: Dialect) -> None:
+def test_a_limit_of_0_a_is_a_pause_until_the_next_limit(dialect: Dialect) -> None:
     async def acts(scene: PolledScene) -> None:
         await scene.charge()
         await scene.charger.change_orders(OrderChange(current=0))
@@ -190,8 +190,10 @@ def test_a_limit_of_0_a_is_a_pause_that_a_limit_ends(dialect: Dialect) -> None:
 
 
 @each
-def test_a_limit_gives_nothing_back_that_it_did_not_take(dialect: Dialect) -> None:
-    """Access was off before the limit was 0 A: somebody said no at the box."""
+def test_a_limit_does_not_turn_on_access_that_it_did_not_turn_off(
+    dialect: Dialect,
+) -> None:
+    """Access was turned off at the box before the limit was 0 A."""
 
     async def acts(scene: PolledScene) -> None:
         scene.box.controller.outlet.set_access(False)
@@ -206,7 +208,7 @@ def test_a_limit_gives_nothing_back_that_it_did_not_take(dialect: Dialect) -> No
 
 
 @each
-def test_the_users_no_outlives_a_limit_of_0_a(dialect: Dialect) -> None:
+def test_a_pause_by_the_user_outlasts_a_limit_of_0_a(dialect: Dialect) -> None:
     async def acts(scene: PolledScene) -> None:
         await scene.charger.change_orders(OrderChange(current=0))
         await scene.charger.change_orders(OrderChange(allowed=False))
@@ -231,7 +233,7 @@ def test_access_opened_at_the_box_is_closed_again(dialect: Dialect) -> None:
 
 
 @each
-def test_no_said_at_the_box_is_respected(dialect: Dialect) -> None:
+def test_access_closed_at_the_box_stays_closed(dialect: Dialect) -> None:
     async def acts(scene: PolledScene) -> None:
         await scene.charge()
         scene.box.controller.outlet.set_access(False)
@@ -244,8 +246,8 @@ def test_no_said_at_the_box_is_respected(dialect: Dialect) -> None:
 
 
 @each
-def test_a_box_that_falls_back_is_told_again(dialect: Dialect) -> None:
-    """A write of 0 by somebody else takes the override off."""
+def test_a_box_that_loses_its_override_gets_it_again(dialect: Dialect) -> None:
+    """A write of 0 by another device removes the override."""
 
     async def acts(scene: PolledScene) -> None:
         await scene.charge()
@@ -283,7 +285,7 @@ def test_a_box_that_ignores_the_access_bit(dialect: Dialect) -> None:
             await scene.charger.change_orders(OrderChange(allowed=False))
         assert Fault.LIMIT_NOT_TAKEN in scene.charger.faults
         scene.box.controller.ignore_access = False
-        # The order stands: the next poll sees to it.
+        # The order stands: a later poll applies it.
         await scene.polled(3)
         assert not scene.outlet.access
         assert Fault.LIMIT_NOT_TAKEN not in scene.charger.faults
@@ -293,7 +295,7 @@ def test_a_box_that_ignores_the_access_bit(dialect: Dialect) -> None:
 
 @each
 def test_lost_answers(dialect: Dialect) -> None:
-    """A write whose answer is lost counts when it is read back."""
+    """A write whose reply is lost is confirmed by its read-back."""
 
     async def acts(scene: PolledScene) -> None:
         await scene.charge()
@@ -355,7 +357,7 @@ def test_another_box_in_its_place() -> None:
     play(PolledScene(LATER), acts)
 
 
-def test_another_firmware_is_learnt_anew() -> None:
+def test_a_changed_firmware_is_identified_anew() -> None:
     async def acts(scene: PolledScene) -> None:
         scene.replace_box(LATER)
         scene.dialect = LATER
@@ -367,7 +369,7 @@ def test_another_firmware_is_learnt_anew() -> None:
     play(PolledScene(V2_20), acts)
 
 
-def test_at_address_0_nobody_else_may_be_there() -> None:
+def test_at_address_0_a_box_must_be_alone() -> None:
     async def acts(scene: PolledScene) -> None:
         since = now()
         scene.bus.add(PolledScene(LATER).make_charger("other"))
@@ -381,7 +383,7 @@ def test_at_address_0_nobody_else_may_be_there() -> None:
 
 @each
 @pytest.mark.parametrize("stop", [True, False])
-def test_farewell(dialect: Dialect, *, stop: bool) -> None:
+def test_shutdown(dialect: Dialect, *, stop: bool) -> None:
     async def acts(scene: PolledScene) -> None:
         await scene.charge()
         before = scene.charger.orders
@@ -393,7 +395,7 @@ def test_farewell(dialect: Dialect, *, stop: bool) -> None:
 
 
 @each
-def test_an_order_that_nobody_renews(dialect: Dialect) -> None:
+def test_an_order_that_is_not_renewed(dialect: Dialect) -> None:
     async def acts(scene: PolledScene) -> None:
         await scene.charge()
         await scene.until(lambda: scene.box.offers == 10)
@@ -404,7 +406,7 @@ def test_an_order_that_nobody_renews(dialect: Dialect) -> None:
 
 
 @each
-def test_below_its_own_minimum_is_a_pause(dialect: Dialect) -> None:
+def test_a_limit_below_its_own_minimum_is_refused(dialect: Dialect) -> None:
     async def acts(scene: PolledScene) -> None:
         assert scene.charger.limits.minimum == 8
         with pytest.raises(RefusedOrderError):
@@ -426,7 +428,7 @@ def test_poll_interval(dialect: Dialect) -> None:
 
 
 @each
-def test_nothing_is_written_without_need(dialect: Dialect) -> None:
+def test_nothing_is_written_unnecessarily(dialect: Dialect) -> None:
     async def acts(scene: PolledScene) -> None:
         await scene.charge()
         await scene.polled(5)
@@ -470,7 +472,7 @@ def test_a_start_whose_answer_was_lost_gives_way_to_a_pause() -> None:
         )
         await scene.until(lambda: 1 in scene.accesses())
         since = now()
-        # Unheard, too, but the box is read back to be off already.
+        # Not received either, but access is read back to be off already.
         await scene.charger.change_orders(OrderChange(allowed=False))
         with pytest.raises(SupersededError):
             await start
@@ -481,7 +483,7 @@ def test_a_start_whose_answer_was_lost_gives_way_to_a_pause() -> None:
 
 @each
 def test_a_power_failure_between_two_cars(dialect: Dialect) -> None:
-    """The next one finds no override of us in the box, unless it is seen to."""
+    """The override is written again before the next car comes."""
 
     async def acts(scene: PolledScene) -> None:
         await scene.charge()
@@ -495,8 +497,8 @@ def test_a_power_failure_between_two_cars(dialect: Dialect) -> None:
     play(PolledScene(dialect), acts)
 
 
-def test_half_a_2_20_is_no_known_firmware() -> None:
-    """It answers 0xA0 with a number and is silent at 0xA9: nothing is written."""
+def test_a_2_20_that_does_not_answer_all_probes_is_unsupported() -> None:
+    """It replies to 0xA0 with a number but not to 0xA9: nothing is written."""
 
     async def run() -> PolledScene:
         scene = PolledScene(V2_20)

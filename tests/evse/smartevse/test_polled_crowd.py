@@ -1,4 +1,4 @@
-"""Many orders at once to a polled SmartEVSE, given up halfway, and hands at the box."""
+"""Many orders at once to a polled SmartEVSE, cancelled ones, and use at the box."""
 
 import asyncio
 from collections.abc import Coroutine
@@ -16,7 +16,7 @@ each = pytest.mark.parametrize("dialect", ALL)
 
 
 def let_go(order: Coroutine[None, None, None]) -> asyncio.Task[None]:
-    """Start an order that nobody waits for; superseded it may be, not failed."""
+    """Start an order in the background; it may be superseded, but not fail."""
 
     async def wait() -> None:
         with suppress(SupersededError):
@@ -34,10 +34,10 @@ def let_go(order: Coroutine[None, None, None]) -> asyncio.Task[None]:
     ],
     ids=["up and down", "down"],
 )
-def test_limits_that_come_quickly_stop_nobody(
+def test_limits_in_quick_succession_stop_no_charge(
     dialect: Dialect, currents: list[float], pause: float
 ) -> None:
-    """A box that had no time to follow is not one that does not follow."""
+    """A box that had no time to follow is not at fault."""
 
     async def acts(scene: PolledScene) -> None:
         await scene.charge()
@@ -57,7 +57,7 @@ def test_limits_that_come_quickly_stop_nobody(
 
 
 @each
-def test_whoever_waits_may_give_up(dialect: Dialect) -> None:
+def test_callers_may_be_cancelled(dialect: Dialect) -> None:
     async def acts(scene: PolledScene) -> None:
         await scene.charge()
         await scene.polled(3)
@@ -74,11 +74,11 @@ def test_whoever_waits_may_give_up(dialect: Dialect) -> None:
             await asyncio.sleep(15)
             assert scene.outlet.access
         for delay in (0, 0.01, 0.03, 0.05, 0.1, 0.2, 0.6, 2):
-            wish = asyncio.create_task(
+            request = asyncio.create_task(
                 scene.charger.configure(Setting.MAXIMUM_CURRENT, 14)
             )
             await asyncio.sleep(delay)
-            wish.cancel()
+            request.cancel()
             await asyncio.sleep(10)
         assert sum(scene.box.controller.eeprom_writes.values()) <= 1
         assert not scene.charger.busy
@@ -87,11 +87,13 @@ def test_whoever_waits_may_give_up(dialect: Dialect) -> None:
 
 
 @each
-def test_a_box_that_follows_no_limit_and_hands_at_it(dialect: Dialect) -> None:
+def test_a_box_that_follows_no_limit_with_access_turned_on_at_it(
+    dialect: Dialect,
+) -> None:
     async def acts(scene: PolledScene) -> None:
         def is_stopped() -> bool:
-            told = Fault.LIMIT_NOT_TAKEN in scene.charger.faults
-            return told and not scene.outlet.access
+            faulty = Fault.LIMIT_NOT_TAKEN in scene.charger.faults
+            return faulty and not scene.outlet.access
 
         scene.car.plug_in()
         await scene.until(is_stopped)

@@ -1,4 +1,4 @@
-"""A polled SmartEVSE when things go wrong at the worst moment."""
+"""A polled SmartEVSE: failures at the worst moment."""
 
 import asyncio
 from contextlib import suppress
@@ -22,7 +22,7 @@ older = pytest.mark.parametrize("dialect", OLDER)
 
 
 async def chatter(scene: PolledScene, seconds: float) -> None:
-    """Let others talk without a pause."""
+    """Keep the line busy."""
     until = now() + seconds
     while now() < until:
         scene.line.noise(b"\xff")
@@ -66,7 +66,7 @@ def test_expired_orders_stay_so_while_the_fail_safe_changes(dialect: Dialect) ->
 
 @each
 @pytest.mark.parametrize("away", [1.0, 600.0])
-def test_how_long_a_power_failure_keeps_access_open(
+def test_access_opened_by_a_power_failure_is_soon_closed(
     dialect: Dialect, away: float
 ) -> None:
     async def acts(scene: PolledScene) -> None:
@@ -94,7 +94,9 @@ def test_access_opened_by_a_setting_is_closed_after_a_failure(
         scene.car.plug_in()
         await scene.polled(2)
         register = 0x0103 if dialect is LATER else 0xE0 if dialect is V2_17 else 0xC3
-        wish = asyncio.create_task(scene.charger.configure(Setting.MAXIMUM_CURRENT, 13))
+        request = asyncio.create_task(
+            scene.charger.configure(Setting.MAXIMUM_CURRENT, 13)
+        )
         await scene.until(lambda: scene.writes(register))
         await asyncio.sleep(0.015)
         scene.box.deaf = True
@@ -102,14 +104,14 @@ def test_access_opened_by_a_setting_is_closed_after_a_failure(
             await asyncio.sleep(0.03)
             scene.line.unplug()
         with pytest.raises(EvseError):
-            await wish
+            await request
         if how == "answers":
             await asyncio.sleep(20)
         scene.box.deaf = False
         assert scene.outlet.access
         await asyncio.sleep(45)
         assert not scene.outlet.access
-        # The user's word opens it.
+        # A start by the user turns it on.
         await scene.charger.change_orders(OrderChange(allowed=True))
         await scene.polled(3)
         assert scene.outlet.access
@@ -118,7 +120,7 @@ def test_access_opened_by_a_setting_is_closed_after_a_failure(
 
 
 def test_a_firmware_without_the_override_is_stopped() -> None:
-    """2.17 as released says no and means it: a limit that cannot be kept is none."""
+    """2.17 as released refuses the override, and does not follow it either."""
 
     async def acts(scene: PolledScene) -> None:
         scene.car.plug_in()
@@ -127,11 +129,11 @@ def test_a_firmware_without_the_override_is_stopped() -> None:
         await scene.polled(2)
         assert Fault.LIMIT_NOT_TAKEN in scene.charger.faults
         assert scene.charger.waits_for_current
-        # A limit that it would not keep either starts nothing.
+        # A limit that it would exceed again starts nothing.
         await scene.charger.change_orders(OrderChange(current=9))
         await scene.polled(3)
         assert scene.accesses() == [0]
-        # One that it cannot break does.
+        # A limit that it cannot exceed does.
         await scene.charger.change_orders(OrderChange(current=16))
         await scene.polled(4)
         assert scene.box.offers == 16
@@ -139,7 +141,7 @@ def test_a_firmware_without_the_override_is_stopped() -> None:
         with pytest.raises(NotConfirmedError, match="set MAX in its menu"):
             await scene.charger.change_orders(OrderChange(current=8))
         assert scene.box.offers == 0
-        # The user's word is tried, once.
+        # A start by the user is tried once.
         await scene.charger.change_orders(OrderChange(allowed=True))
         await scene.until(lambda: scene.box.offers > 0)
         assert await scene.until(lambda: scene.box.offers == 0) < 12
@@ -197,23 +199,23 @@ def test_a_scan_does_not_stop_a_later_box(after: float) -> None:
     play(PolledScene(LATER), acts)
 
 
-def test_a_fault_of_a_shared_address_does_not_come_and_go() -> None:
+def test_the_fault_of_a_shared_address_is_steady() -> None:
     async def acts(scene: PolledScene) -> None:
         scene.bus.add(PolledScene(V2_20).make_charger("other"))
-        told: list[bool] = []
+        faults: list[bool] = []
         scene.charger.subscribe(
-            lambda: told.append(Fault.DUPLICATE_ADDRESS in scene.charger.faults)
+            lambda: faults.append(Fault.DUPLICATE_ADDRESS in scene.charger.faults)
         )
         scene.car.plug_in()
         await asyncio.sleep(60)
         assert Fault.DUPLICATE_ADDRESS in scene.charger.faults
-        changes = sum(a != b for a, b in pairwise(told))
+        changes = sum(a != b for a, b in pairwise(faults))
         assert changes <= 1
 
     play(PolledScene(V2_17), acts)
 
 
-def test_a_status_that_comes_late_is_no_configuration() -> None:
+def test_a_late_status_is_not_taken_for_settings() -> None:
     """In 2.17 both are nine words."""
 
     async def acts(scene: PolledScene) -> None:
@@ -243,8 +245,8 @@ def test_a_status_that_comes_late_is_no_configuration() -> None:
     play(PolledScene(V2_17), acts)
 
 
-def test_a_pause_while_a_later_box_wakes_its_car_up() -> None:
-    """It goes on to B, and from there to C, whatever its access bit says."""
+def test_a_pause_while_a_later_box_wakes_its_car() -> None:
+    """It goes on to B, and from there to C, whatever its access bit."""
 
     async def acts(scene: PolledScene) -> None:
         scene.car.plug_in(request=False)
@@ -265,7 +267,7 @@ def test_a_pause_while_a_later_box_wakes_its_car_up() -> None:
 
 
 @each
-def test_a_start_half_done_does_not_outlive_the_farewell(dialect: Dialect) -> None:
+def test_a_start_half_done_does_not_outlive_the_shutdown(dialect: Dialect) -> None:
     async def acts(scene: PolledScene) -> None:
         await scene.charge()
         await scene.polled(4)
@@ -286,7 +288,7 @@ def test_a_start_half_done_does_not_outlive_the_farewell(dialect: Dialect) -> No
 
 
 @each
-def test_a_limit_that_no_order_took_away_comes_back(dialect: Dialect) -> None:
+def test_a_pause_by_the_installation_limit_ends_with_it(dialect: Dialect) -> None:
     async def acts(scene: PolledScene) -> None:
         await scene.charge()
         await scene.polled(3)
@@ -296,7 +298,7 @@ def test_a_limit_that_no_order_took_away_comes_back(dialect: Dialect) -> None:
         await scene.polled(2)
         scene.charger.reconfigure(config)
         await scene.until(lambda: scene.box.offers == 10, 40)
-        # A no at the box is another matter.
+        # Access turned off at the box stays off.
         scene.box.controller.outlet.set_access(False)
         await scene.polled(3)
         assert not scene.outlet.access

@@ -20,7 +20,7 @@ SCALE = 10.0
 
 async def until(holds: Callable[[], object]) -> None:
     async with asyncio.timeout(10):
-        while not holds():  # noqa: ASYNC110 - what changes has nobody to tell
+        while not holds():  # noqa: ASYNC110 - the virtual box has no event for it
             await asyncio.sleep(0.01)
 
 

@@ -1,4 +1,4 @@
-"""Registers of a SmartEVSE: bytes of the recorded firmware, and anything at all."""
+"""Registers of a SmartEVSE: bytes of the recorded firmware, and random ones."""
 
 import asyncio
 from dataclasses import replace
@@ -24,7 +24,7 @@ from custom_components.evse_bus.evse.model import (
     Mode,
     Orders,
     Setting,
-    Status as Word,
+    Status as OcppStatus,
 )
 from custom_components.evse_bus.evse.registers import Block
 from custom_components.evse_bus.evse.safety import clamp
@@ -115,7 +115,7 @@ def test_no_communication_as_recorded() -> None:
     assert data is not None
     status = decode_status(V2_17, data)
     assert status.faults == {Fault.NO_COMM}
-    assert ocpp_status(V2_17, status) is Word.FAULTED
+    assert ocpp_status(V2_17, status) is OcppStatus.FAULTED
     assert not shows_plug(V2_17, status)
 
 
@@ -124,13 +124,15 @@ def test_configuration_as_recorded() -> None:
     blocks = MAPS[V2_17].configuration
     first = bytes.fromhex("000000000006001000000004000000000000")
     second = bytes.fromhex("000d00000019")
-    told = decode_configuration(V2_17, dict(zip(blocks, (first, second), strict=True)))
-    assert told.settings == {
+    configuration = decode_configuration(
+        V2_17, dict(zip(blocks, (first, second), strict=True))
+    )
+    assert configuration.settings == {
         Setting.MINIMUM_CURRENT: 6,
         Setting.MAXIMUM_CURRENT: 13,
         Setting.MAINS_CURRENT: 25,
     }
-    assert told.load_balancing == 0
+    assert configuration.load_balancing == 0
 
 
 def test_the_malformed_exceptions() -> None:
@@ -138,7 +140,7 @@ def test_the_malformed_exceptions() -> None:
         read_answer(0, Block(0xB0, 1, READ_INPUT_REGISTERS))(frame("000402f2c1"))
     assert refused.value.code == 2
     accept = write_answer(0, 0xA6)
-    # "No", and it is obeyed all the same: perhaps.
+    # A refusal that is obeyed all the same: unknown until it is read back.
     assert accept(frame("0010033c01")) is False
     assert accept(frame("001000a70001b1fb")) is None
     assert write_answer(0, 0xA7)(frame("001000a70001b1fb")) is True
@@ -156,7 +158,7 @@ def test_0_a_is_never_written() -> None:
             write_current(0, dialect, paused)
 
 
-def test_a_box_has_an_address() -> None:
+def test_an_impossible_address_is_refused() -> None:
     for unit in (-1, 9, 255):
         with pytest.raises(RefusedOrderError):
             write_access(unit, V2_17, allowed=True)
@@ -171,12 +173,12 @@ def test_mode_and_settings() -> None:
             write_setting(1, LATER, Setting.SOLAR_START_CURRENT, value)
 
 
-# -- Anything at all -----------------------------------------------------------------
+# -- Random bytes --------------------------------------------------------------------
 
 
 @each
 @given(data=st.binary(max_size=40))
-def test_any_bytes_are_a_status_or_held_back(dialect: Dialect, data: bytes) -> None:
+def test_any_bytes_are_a_status_or_implausible(dialect: Dialect, data: bytes) -> None:
     try:
         status = decode_status(dialect, data)
     except ImplausibleReplyError:
@@ -197,16 +199,16 @@ _word = st.one_of(st.integers(0, 12), st.integers(0x41, 0x54), st.integers(0, 0x
 @given(values=st.lists(_word, min_size=9, max_size=9), more=st.lists(_word, max_size=3))
 def test_nearly_a_status(dialect: Dialect, values: list[int], more: list[int]) -> None:
     table = MAPS[dialect].status
-    told = (values + more + [0] * 3)[: table.block.words]
+    registers = (values + more + [0] * 3)[: table.block.words]
 
     def word(name: str) -> int:
-        return told[table.words[name].register - table.block.register]
+        return registers[table.words[name].register - table.block.register]
 
     try:
-        status = decode_status(dialect, words(*told))
+        status = decode_status(dialect, words(*registers))
     except ImplausibleReplyError:
         return
-    assert status.raw_state == table.words["raw_state"].kind.value(told[0])
+    assert status.raw_state == table.words["raw_state"].kind.value(registers[0])
     assert status.current == word("current") / 10
     assert status.access is (word("access") == 1)
     assert word("access") in (0, 1)
@@ -216,11 +218,11 @@ def test_nearly_a_status(dialect: Dialect, values: list[int], more: list[int]) -
 
 @each
 @given(data=st.data())
-def test_any_settings_are_in_their_range_or_held_back(
+def test_any_settings_are_in_their_range_or_implausible(
     dialect: Dialect, data: st.DataObject
 ) -> None:
     layout = MAPS[dialect]
-    told = {
+    blocks = {
         block: words(
             *data.draw(
                 st.lists(
@@ -233,7 +235,7 @@ def test_any_settings_are_in_their_range_or_held_back(
         for block in layout.configuration
     }
     try:
-        configuration = decode_configuration(dialect, told)
+        configuration = decode_configuration(dialect, blocks)
     except ImplausibleReplyError:
         return
     for setting, value in configuration.settings.items():
@@ -244,14 +246,14 @@ def test_any_settings_are_in_their_range_or_held_back(
         assert word.kind.value(word.kind.raw(value)) == value
 
 
-def test_settings_that_are_not_all_told() -> None:
+def test_settings_that_were_not_all_read() -> None:
     with pytest.raises(ImplausibleReplyError):
         decode_configuration(V2_17, {})
 
 
 @each
 @given(current=st.floats(6, 80), unit=st.integers(0, 8), allowed=st.booleans())
-def test_what_is_written_is_what_was_clamped(
+def test_a_written_current_is_the_clamped_one(
     dialect: Dialect, current: float, unit: int, *, allowed: bool
 ) -> None:
     request = write_current(unit, dialect, setpoint(current))
@@ -368,7 +370,7 @@ def test_a_dialect_is_found_only_by_its_own_registers(
 def test_a_without_access_is_not_unplugged() -> None:
     status = decode_status(V2_17, words(0x41, 0, 16, 6, 0, 0, 130, 0, 0))
     assert not shows_plug(V2_17, status)
-    assert ocpp_status(V2_17, status) is Word.UNAVAILABLE
+    assert ocpp_status(V2_17, status) is OcppStatus.UNAVAILABLE
     assert is_stopped(V2_17, status)
     assert offered(V2_17, status) == 0
     assert shows_plug(V2_17, replace(status, access=True))
@@ -380,18 +382,18 @@ def test_later_states() -> None:
     assert state_of(LATER, "C1").charging is None
     waiting = replace(stopping, raw_state="B1", access=False)
     assert is_stopped(LATER, waiting)
-    assert ocpp_status(LATER, waiting) is Word.SUSPENDED_EVSE
+    assert ocpp_status(LATER, waiting) is OcppStatus.SUSPENDED_EVSE
     assert shows_plug(LATER, waiting)
     assert stopping.serial == "4711"
     assert stopping.temperature == 20
 
 
-def test_a_temperature_that_cannot_be_is_none() -> None:
+def test_an_impossible_temperature_is_none() -> None:
     assert decode_status(LATER, later(kelvin=0)).temperature is None
     assert decode_status(LATER, later(serial=0)).serial is None
 
 
-def test_nothing_to_say_is_6_a() -> None:
+def test_a_current_out_of_range_is_6_a() -> None:
     """A broadcast of 0 to a charging slave: the contactor stays closed."""
     status = decode_status(V2_17, words(0x43, 0, 16, 6, 0, 0, 0, 1, 0))
     assert offered(V2_17, status) == 6

@@ -1,7 +1,7 @@
-"""The library, polled against what the maker's firmware was recorded to answer.
+"""A polled SmartEVSE that knows only the recorded exchanges of the maker's firmware.
 
-A box that knows nothing but the recorded exchanges: what the library asks beside them
-would stay unanswered, and what it writes must be a recorded request, byte for byte.
+Other requests of the library would stay unanswered, and what it writes must be a
+recorded request, byte for byte.
 """
 
 import asyncio
@@ -59,15 +59,15 @@ A_UNUSED = next(
 
 @dataclass
 class Recorded:
-    """The box: what it answers to a read now, and what it was told."""
+    """The recorded box: its present status, and the requests that it received."""
 
     status: str = A_UNUSED
     override_follows: bool = True
-    heard: list[str] = field(default_factory=list)
+    requests: list[str] = field(default_factory=list)
     unknown: list[str] = field(default_factory=list)
 
     def answer(self, request: str) -> str | None:
-        self.heard.append(request)
+        self.requests.append(request)
         if request == READ:
             return self.status
         if request.startswith(OVERRIDE):
@@ -117,9 +117,9 @@ class Tape(Line):
         self.last_activity = end
         answer = self.box.answer(data.hex()) or self._shorter(data)
         if answer is not None:
-            told = bytes.fromhex(answer)
-            at = end + 0.01 + len(told) * self.settings.byte_time
-            asyncio.get_running_loop().call_at(at, self.on_data, told)
+            frame = bytes.fromhex(answer)
+            at = end + 0.01 + len(frame) * self.settings.byte_time
+            asyncio.get_running_loop().call_at(at, self.on_data, frame)
         return end
 
     def _shorter(self, data: bytes) -> str | None:
@@ -146,7 +146,7 @@ def test_a_recorded_session() -> None:
             assert charger.reading is not None
             assert charger.reading.connectors[1].status is Status.AVAILABLE
             assert charger.reading.settings[Setting.MAXIMUM_CURRENT] == 13
-            # Its own 13 A count more than the order.
+            # Its own 13 A are less than the order.
             assert charger.limits.ceiling == 13
             box.status = B
             await asyncio.sleep(3)
@@ -165,10 +165,10 @@ def test_a_recorded_session() -> None:
         return box
 
     box = simulate(scene())
-    writes = [one for one in box.heard if one.startswith("0010")]
+    writes = [one for one in box.requests if one.startswith("0010")]
     assert NO_ACCESS in writes
     assert ACCESS in writes
-    # Nothing but the override beside what was recorded: 6.0 A ahead, 13.0 A then.
+    # Only the overrides are not in the recording: 6.0 A before a car comes, then 13.0 A.
     others = {one[14:18] for one in writes if one not in (NO_ACCESS, ACCESS)}
     assert others == {"003c", "0082"}
     assert box.unknown == []
@@ -196,7 +196,7 @@ def test_a_refused_override_counts_when_it_is_read_back(*, follows: bool) -> Non
             await charger.change_orders(OrderChange(current=10))
             assert charger.reading is not None
             assert charger.reading.offered_current == 10
-            # The box took its 1.8 s, and was believed no sooner.
+            # The box took its 1.8 s, and the order was not confirmed sooner.
             assert 1.8 <= now() - began < 3
 
     simulate(scene())

@@ -1,4 +1,4 @@
-"""What a SmartEVSE keeps in its EEPROM, and its volatile mode."""
+"""Settings in the EEPROM of a SmartEVSE, and its volatile mode."""
 
 import asyncio
 
@@ -37,7 +37,9 @@ CASES = [(dialect, setting) for dialect in ALL for setting in MAPS[dialect].sett
 
 
 @pytest.mark.parametrize(("dialect", "setting"), CASES)
-def test_a_setting_is_what_the_box_calls_so(dialect: Dialect, setting: Setting) -> None:
+def test_a_setting_is_that_of_the_same_name_in_the_box(
+    dialect: Dialect, setting: Setting
+) -> None:
     """The virtual box was written from the firmware's order, not from our table."""
 
     async def acts(scene: PolledScene) -> None:
@@ -81,7 +83,7 @@ def test_no_maximum_above_the_installation(dialect: Dialect) -> None:
 
 
 @each
-def test_what_is_set_already_is_not_written(dialect: Dialect) -> None:
+def test_an_equal_value_is_not_written(dialect: Dialect) -> None:
     async def acts(scene: PolledScene) -> None:
         await scene.charger.configure(Setting.MAXIMUM_CURRENT, 16)
         assert not scene.box.controller.eeprom_writes
@@ -114,7 +116,7 @@ def test_access_that_a_setting_opens_is_closed_again(
     play(PolledScene(dialect, allowed=False), acts)
 
 
-def test_access_that_stays_open_is_said_loudly() -> None:
+def test_access_that_stays_open_is_an_error() -> None:
     async def acts(scene: PolledScene) -> None:
         await scene.charger.change_orders(OrderChange(allowed=False))
         scene.box.controller.ignore_access = True
@@ -126,7 +128,7 @@ def test_access_that_stays_open_is_said_loudly() -> None:
 
 @each
 def test_a_lower_maximum_lowers_the_current(dialect: Dialect) -> None:
-    """The override beats the box's own maximum: the clamp is ours."""
+    """The override takes precedence over the box's own maximum: the clamp is ours."""
 
     async def acts(scene: PolledScene) -> None:
         await scene.charge()
@@ -149,7 +151,7 @@ def test_a_setting_that_is_not_known(dialect: Dialect) -> None:
 
 
 @each
-def test_settings_changed_at_the_box_are_seen(dialect: Dialect) -> None:
+def test_settings_changed_at_the_box_are_read(dialect: Dialect) -> None:
     async def acts(scene: PolledScene) -> None:
         scene.outlet.settings["max_current"] = 12
         await asyncio.sleep(310)
@@ -188,7 +190,7 @@ def test_where_the_mode_cannot_be_set(
         with pytest.raises(NotAvailableError, match="menu"):
             await scene.charger.command(Command.SET_MODE, Mode.SOLAR)
         assert scene.writes(register) == []
-        # What is so already needs no setting.
+        # The present mode is accepted.
         now_set = (Mode.NORMAL, Mode.SMART)[mode]
         await scene.charger.command(Command.SET_MODE, now_set)
         assert scene.charger.available
@@ -196,7 +198,7 @@ def test_where_the_mode_cannot_be_set(
     play(PolledScene(dialect, load_balance=load_balance, settings={"mode": mode}), acts)
 
 
-def test_what_is_no_mode() -> None:
+def test_a_value_that_is_no_mode_is_refused() -> None:
     async def acts(scene: PolledScene) -> None:
         with pytest.raises(RefusedOrderError):
             await scene.charger.command(Command.SET_MODE, "fast")

@@ -1,4 +1,4 @@
-"""Sharing a supply: splits, and what boxes may be offering; pure."""
+"""Sharing a circuit limit: shares, values of broadcasts, and draws; pure."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -20,16 +20,18 @@ from custom_components.evse_bus.evse.smartevse.sharing import (
 )
 
 
-def claims(*wishes: int) -> list[Claim]:
-    return [Claim(unit=2 + n, demand=wish, since=n) for n, wish in enumerate(wishes)]
+def claims(*demands: int) -> list[Claim]:
+    return [
+        Claim(unit=2 + n, demand=demand, since=n) for n, demand in enumerate(demands)
+    ]
 
 
 @pytest.mark.parametrize(
-    ("limit", "minimum", "wishes", "shares"),
+    ("limit", "minimum", "demands", "shares"),
     [
         (160, 60, (160,), (160,)),
         (160, 60, (160, 160), (80, 80)),
-        # What one cannot use the other gets.
+        # The other gets the part that one cannot use.
         (160, 60, (60, 160), (60, 100)),
         (250, 60, (100, 130, 320), (83, 83, 83)),
         (320, 60, (60, 130, 320), (60, 130, 130)),
@@ -38,7 +40,7 @@ def claims(*wishes: int) -> list[Claim]:
         (160, 60, (160, 160, 160), (80, 80, 0)),
         (180, 60, (160, 160, 160), (60, 60, 60)),
         (160, 100, (160, 160), (160, 0)),
-        # A wish below the minimum is no reason to give nothing.
+        # A demand below the minimum is met all the same.
         (160, 80, (60, 160), (60, 100)),
         (59, 60, (160,), (0,)),
         (0, 60, (160,), (0,)),
@@ -46,23 +48,23 @@ def claims(*wishes: int) -> list[Claim]:
     ],
 )
 def test_split(
-    limit: int, minimum: int, wishes: tuple[int, ...], shares: tuple[int, ...]
+    limit: int, minimum: int, demands: tuple[int, ...], shares: tuple[int, ...]
 ) -> None:
-    assert tuple(split(limit, minimum, claims(*wishes)).values()) == shares
+    assert tuple(split(limit, minimum, claims(*demands)).values()) == shares
 
 
 @pytest.mark.parametrize(
-    ("limit", "values", "active", "said"),
+    ("limit", "values", "active", "fitted"),
     [
-        # One charges with all there is: the other is told nothing until it asks.
+        # One charges with the whole limit: the value of the other is 0 until it requests.
         (160, (160, 160), (2,), (160, 0)),
         (200, (160, 100), (2,), (160, 0)),
         (320, (160, 100), (2,), (160, 100)),
-        # Nobody charges: none is told more than its part.
+        # None charges: no value is above its part.
         (160, (160, 160), (), (80, 80)),
         (160, (160, 160, 160), (), (0, 0, 0)),
         (160, (160,), (), (160,)),
-        # The second is being stopped, and offers 6 A until it has heard so.
+        # The second is being stopped, and offers 6 A until it has received that.
         (130, (70, 60, 0), (2, 3, 4), (60, 60, 0)),
         (80, (80, 0), (2, 3), (60, 0)),
     ],
@@ -71,33 +73,33 @@ def test_fit_to_limit(
     limit: int,
     values: tuple[int, ...],
     active: tuple[int, ...],
-    said: tuple[int, ...],
+    fitted: tuple[int, ...],
 ) -> None:
     by_unit = dict(enumerate(values, 2))
-    assert tuple(fit_to_limit(limit, by_unit, active).values()) == said
+    assert tuple(fit_to_limit(limit, by_unit, active).values()) == fitted
 
 
 @given(
     limit=st.integers(0, 900),
     minimum=st.integers(60, 160),
-    wishes=st.lists(st.integers(0, 800), min_size=1, max_size=3),
+    demands=st.lists(st.integers(0, 800), min_size=1, max_size=3),
     idle=st.lists(st.integers(60, 800), max_size=2),
 )
-def test_what_is_said_together_is_never_above_the_limit(
-    limit: int, minimum: int, wishes: list[int], idle: list[int]
+def test_the_values_of_a_broadcast_are_never_above_the_limit(
+    limit: int, minimum: int, demands: list[int], idle: list[int]
 ) -> None:
-    shares = split(limit, minimum, claims(*wishes))
+    shares = split(limit, minimum, claims(*demands))
     values = shares | dict(enumerate(idle, 10))
-    said = fit_to_limit(limit, values, shares)
-    assert sum(said.values()) <= limit
-    assert all(said[unit] <= value for unit, value in values.items())
-    assert all(value == 0 or value >= LOWEST for value in said.values())
+    fitted = fit_to_limit(limit, values, shares)
+    assert sum(fitted.values()) <= limit
+    assert all(fitted[unit] <= value for unit, value in values.items())
+    assert all(value == 0 or value >= LOWEST for value in fitted.values())
     if len(shares) * LOWEST <= limit and all(shares.values()):
-        # Nothing is taken from those who draw where there is enough.
-        assert {unit: said[unit] for unit in shares} == shares
+        # Nothing is taken from those that draw where there is enough.
+        assert {unit: fitted[unit] for unit in shares} == shares
 
 
-def test_what_nobody_can_stop_has_its_6_a_before_all() -> None:
+def test_6_a_is_reserved_first_for_boxes_that_cannot_be_stopped() -> None:
     gone = Claim(unit=2, demand=60, since=9, fixed=True)
     stopping = Claim(unit=3, demand=0, since=9, fixed=True)
     last = Claim(unit=4, demand=160)
@@ -109,24 +111,24 @@ def test_what_nobody_can_stop_has_its_6_a_before_all() -> None:
 @given(
     limit=st.integers(0, 900),
     minimum=st.integers(60, 160),
-    wishes=st.lists(st.integers(0, 800), max_size=3),
+    demands=st.lists(st.integers(0, 800), max_size=3),
 )
-def test_a_split_keeps_to_the_limit_and_to_the_wishes(
-    limit: int, minimum: int, wishes: list[int]
+def test_a_split_keeps_to_the_limit_and_to_the_demands(
+    limit: int, minimum: int, demands: list[int]
 ) -> None:
-    shares = split(limit, minimum, claims(*wishes))
+    shares = split(limit, minimum, claims(*demands))
     assert sum(shares.values()) <= limit
-    for claim in claims(*wishes):
+    for claim in claims(*demands):
         share = shares[claim.unit]
         assert share <= claim.demand
         assert share == 0 or share >= min(minimum, claim.demand) >= LOWEST
     rest = limit - sum(shares.values())
-    unsatisfied = [c for c in claims(*wishes) if LOWEST <= shares[c.unit] < c.demand]
+    unsatisfied = [c for c in claims(*demands) if LOWEST <= shares[c.unit] < c.demand]
     # Less is left than there are boxes that could use it.
     assert not unsatisfied or rest < len(unsatisfied)
 
 
-def test_nonsense_counts_as_what_a_box_makes_of_it() -> None:
+def test_a_value_out_of_range_counts_as_the_lowest() -> None:
     assert [offered(value) for value in (0, 59, 60, 800, 801)] == [60, 60, 60, 800, 60]
 
 
@@ -145,7 +147,7 @@ def test_a_draw_counts_everything_a_box_may_be_following() -> None:
     assert draw.most(2.2) == 0
 
 
-def test_who_is_not_heard_may_still_hear() -> None:
+def test_a_box_that_does_not_answer_may_still_receive() -> None:
     draw = Draw()
     draw.read(160, 0.0, closed=True)
     for second in range(2, 30, 2):
@@ -156,7 +158,7 @@ def test_who_is_not_heard_may_still_hear() -> None:
     assert draw.most(28 + STOPS_ALONE) == 0
 
 
-def test_nobody_knows_what_goes_on_before_the_first_word() -> None:
+def test_a_draw_is_unknown_before_the_first_broadcast() -> None:
     draw = Draw(unknown_until=12.0)
     draw.sent(60, 5.0)
     assert draw.most(11.9) == float("inf")
@@ -165,7 +167,7 @@ def test_nobody_knows_what_goes_on_before_the_first_word() -> None:
     assert draw.most(6.0) == 0
 
 
-def test_a_grant_counts_until_a_later_broadcast_was_surely_heard() -> None:
+def test_a_grant_counts_until_a_later_broadcast_was_surely_received() -> None:
     draw = Draw()
     draw.read(160, 0.0, closed=False)
     draw.granted(160, 1.0)
@@ -192,16 +194,16 @@ def test_a_repeated_request_does_not_undo_its_grant() -> None:
 
 @dataclass
 class Slave:
-    """What the firmware does with what it hears (PROTOCOLS.md, 3)."""
+    """The behaviour of the firmware (PROTOCOLS.md, 3)."""
 
-    heard: int = 0
+    received: int = 0
     pilot: int = 0
     closed: bool = False
     in_b: bool = False
     silence: float = 0.0
 
     def broadcast(self, value: int) -> None:
-        self.heard = value
+        self.received = value
         self.silence = 0.0
         if self.closed or self.in_b:
             self.pilot = offered(value)
@@ -226,7 +228,7 @@ class World:
     limit: int
     minimum: int
     slaves: dict[int, Slave]
-    wishes: dict[int, int]
+    demands: dict[int, int]
     draws: dict[int, Draw] = field(default_factory=dict)
     now: float = 0.0
     gone: set[int] = field(default_factory=set)
@@ -237,12 +239,12 @@ class World:
     def shares(self, asking: int | None = None) -> dict[int, int]:
         active = []
         for unit, draw in self.draws.items():
-            wish = self.wishes[unit]
-            unreachable = unit in self.gone or wish < LOWEST
+            demand = self.demands[unit]
+            unreachable = unit in self.gone or demand < LOWEST
             fixed = draw.may_draw and unreachable
             if draw.may_draw or unit == asking:
-                wish = min(wish, LOWEST) if fixed else wish
-                active.append(Claim(unit=unit, demand=wish, since=unit, fixed=fixed))
+                demand = min(demand, LOWEST) if fixed else demand
+                active.append(Claim(unit=unit, demand=demand, since=unit, fixed=fixed))
         return dict.fromkeys(self.draws, 0) | split(self.limit, self.minimum, active)
 
     def broadcast(self, hearing: set[int], asking: int | None = None) -> None:
@@ -255,7 +257,7 @@ class World:
     def read(self, unit: int) -> None:
         if unit not in self.gone:
             slave = self.slaves[unit]
-            self.draws[unit].read(slave.heard, self.now, closed=slave.closed)
+            self.draws[unit].read(slave.received, self.now, closed=slave.closed)
 
     def ask(self, unit: int, *, arrives: bool) -> None:
         slave = self.slaves[unit]
@@ -283,8 +285,8 @@ class World:
                 self.slaves[unit].closed = False
             case "b":
                 self.slaves[unit].in_b = not self.slaves[unit].in_b
-            case "wish":
-                self.wishes[unit] = rest[1]
+            case "demand":
+                self.demands[unit] = rest[1]
             case "gone":
                 self.gone.add(unit)
             case "back":
@@ -307,7 +309,7 @@ steps = st.one_of(
     st.tuples(st.just("ask"), units, st.booleans()),
     st.tuples(st.just("end"), units),
     st.tuples(st.just("b"), units),
-    st.tuples(st.just("wish"), units, st.sampled_from((0, 60, 77, 160, 320))),
+    st.tuples(st.just("demand"), units, st.sampled_from((0, 60, 77, 160, 320))),
     st.tuples(st.just("gone"), units),
     st.tuples(st.just("back"), units),
     st.tuples(st.just("reset"), units),
@@ -325,9 +327,9 @@ steps = st.one_of(
 def test_boxes_never_offer_more_than_the_limit(
     limit: int, minimum: int, before: tuple[int, int, int], story: list[tuple]
 ) -> None:
-    """18 A are enough for the 6 A of those that nobody can stop."""
+    """18 A are 6 A for each of three, whether it can be stopped or not."""
     slaves = {
-        unit: Slave(heard=pilot, pilot=pilot, closed=pilot > 0)
+        unit: Slave(received=pilot, pilot=pilot, closed=pilot > 0)
         for unit, pilot in zip((2, 3, 4), before, strict=True)
     }
     world = World(limit, minimum, slaves, dict.fromkeys(slaves, 320))
@@ -337,14 +339,14 @@ def test_boxes_never_offer_more_than_the_limit(
 
 
 def test_first_others_go_down_then_one_goes_up() -> None:
-    slaves = {2: Slave(heard=160, pilot=160, closed=True), 3: Slave(heard=80)}
+    slaves = {2: Slave(received=160, pilot=160, closed=True), 3: Slave(received=80)}
     world = World(160, 60, slaves, {2: 160, 3: 160})
     world.read(2)
     world.read(3)
     world.ask(3, arrives=True)
     assert slaves[3].offers == 0
     assert above_share(world.shares(3), world.draws, world.now) == [2]
-    # It misses the first: no room is believed before it is read back.
+    # It misses the first: it does not count as down before it is read back.
     world.broadcast({3}, asking=3)
     world.read(2)
     assert grant(160, 80, 3, world.draws, world.now) == 0

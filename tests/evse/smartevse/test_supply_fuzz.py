@@ -1,7 +1,7 @@
-"""Property: whatever happens on the bus, the boxes together keep to the supply.
+"""Property: whatever happens on the bus, the boxes together keep to the circuit limit.
 
-Requests, lost broadcasts and answers, orders, boxes that die and go on hearing, a
-lost port, a restart: the witness is what the boxes offer with closed contactors.
+Requests, lost broadcasts and answers, orders, boxes that fall silent but still receive,
+a lost port, a restart: the oracle is the sum of offers with closed contactors.
 """
 
 import asyncio
@@ -11,7 +11,7 @@ from random import Random
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from custom_components.evse_bus.evse.errors import EvseError
-from custom_components.evse_bus.evse.model import OrderChange
+from custom_components.evse_bus.evse.model import Circuit, OrderChange
 from tests.evse.smartevse.ether import Box, MasterScene
 from tests.simulated_time import simulate
 
@@ -73,7 +73,7 @@ async def act_on_bus(scene: MasterScene, what: str, unit: int) -> None:
     if what == "unplug":
         scene.line.unplug()
     elif what == "again":
-        # Home Assistant is killed, and started again.
+        # Home Assistant is restarted without a shutdown.
         await scene.bus.stop()
         scene.new_bus()
         for one in UNITS:
@@ -100,10 +100,10 @@ async def act_on_bus(scene: MasterScene, what: str, unit: int) -> None:
     minimum=st.sampled_from((6.0, 8.0)),
     seed=st.integers(0, 1000),
 )
-def test_never_more_than_the_supply(
+def test_never_more_than_the_circuit_limit(
     story: list[Act], limit: float, minimum: float, seed: int
 ) -> None:
-    """18 A are 6 A for each of three: what nobody can stop still fits."""
+    """18 A are 6 A for each of three, whether it can be stopped or not."""
 
     async def scene() -> None:
         dice = Random(seed)  # noqa: S311 - the same each time
@@ -127,16 +127,17 @@ def test_never_more_than_the_supply(
     then=st.sampled_from((18.0, 12.0, 6.0, 0.0)),
     at=st.floats(0.0, 2.0),
 )
-def test_a_lower_supply_counts_at_once(first: float, then: float, at: float) -> None:
+def test_a_lower_circuit_limit_counts_at_once(
+    first: float, then: float, at: float
+) -> None:
     async def scene() -> None:
         scene = MasterScene(limit=first, maximum=32, watch=False)
         async with scene:
             await asyncio.sleep(4)
             await scene.charge(2, 3)
             await asyncio.sleep(6 + at)
-            supply = scene.master.circuit
-            await scene.master.change_circuit(type(supply)(limit=then))
-            # One broadcast, and a stop for each box that is too many.
+            await scene.master.change_circuit(Circuit(limit=then))
+            # One broadcast, and a stop for each box for which there is no current.
             await asyncio.sleep(1.0)
             assert scene.offers <= then
             scene.overshoot = 0.0

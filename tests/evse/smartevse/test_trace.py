@@ -1,8 +1,7 @@
-"""The bytes recorded from the maker's firmware, against the library.
+"""The encoders and decoders of the library against the maker's firmware, as recorded.
 
-Every answer is found and understood; every request that the library would make in the
-recorded session is the recorded one, byte for byte; and the library, polled against
-the recorded answers, asks and writes nothing else.
+Every recorded reply is decoded, and every request that the library would make in the
+recorded session is the recorded one, byte for byte.
 """
 
 from collections.abc import Iterator
@@ -39,7 +38,7 @@ DIALECT = Dialect.V2_17
 
 
 def everything() -> Iterator[tuple[str, bytes]]:
-    """Yield all that was on the wire, requests and answers, in whole frames."""
+    """Yield all recorded bytes, requests and replies, in whole frames."""
     for section, entries in TRACE.items():
         for entry in entries:
             for key in ("request", "reply", "hex", "slave_sent", "master_ack"):
@@ -71,7 +70,7 @@ def test_every_byte_belongs_to_a_frame(*, by_bytes: bool) -> None:
 
 
 @pytest.mark.parametrize("section", TRACE)
-def test_every_status_is_understood(section: str) -> None:
+def test_every_status_is_decoded(section: str) -> None:
     for entry in TRACE[section]:
         text = entry.get("reply") or entry.get("hex")
         if not text or len(text) != 2 * 23:
@@ -113,7 +112,7 @@ def test_our_requests_are_the_recorded_ones() -> None:
                 continue
             ours = rebuilt(request)
             if ours is None:
-                # What the library does not say: 0x06, and a current of 0 A.
+                # The library never sends these: 0x06, and a current of 0 A.
                 assert (
                     request[1] == 6
                     or request[-4:-2] == b"\x00\x00"
@@ -130,7 +129,7 @@ def test_our_requests_are_the_recorded_ones() -> None:
     list(answers("normal")),
     ids=[what for what, _, _ in answers("normal")],
 )
-def test_every_answer_is_known_for_what_it_is(
+def test_every_reply_is_accepted_for_its_request(
     what: str, request_: bytes, reply: bytes
 ) -> None:
     (frame,) = RtuFramer().feed(reply)
@@ -146,12 +145,12 @@ def test_every_answer_is_known_for_what_it_is(
         assert data is not None
         assert len(data) == 2 * block.words
     elif function == 0x10:
-        # "Perhaps" for the override, which is obeyed; "yes" for the access bit.
+        # False for the override, which is obeyed; True for the access bit.
         assert write_answer(unit, register)(frame) is (register == 0xA7), what
 
 
 def test_the_factory_defaults() -> None:
-    told = {}
+    blocks = {}
     for _, request, reply in answers("normal"):
         register, count = (int.from_bytes(request[i : i + 2]) for i in (2, 4))
         if register in (0xC0, 0xE0):
@@ -159,12 +158,12 @@ def test_the_factory_defaults() -> None:
             data = read_answer(0, Block(register, count, READ_INPUT_REGISTERS))(frame)
             assert data is not None
             words = 9 if register == 0xC0 else 3
-            told[Block(register, words)] = data[: 2 * words]
-    settings = decode_configuration(DIALECT, told).settings
+            blocks[Block(register, words)] = data[: 2 * words]
+    settings = decode_configuration(DIALECT, blocks).settings
     assert sorted(settings.values()) == [6, 13, 25]
 
 
-def test_what_takes_the_override_off_is_never_built() -> None:
+def test_a_request_that_removes_the_override_is_never_built() -> None:
     removed = next(e for e in TRACE["normal"] if e["what"] == "FC10 A6=0")
     assert bytes.fromhex(removed["request"])[:-2].endswith(write_registers(0xA6, (0,)))
     assert rebuilt(bytes.fromhex(removed["request"])) is None

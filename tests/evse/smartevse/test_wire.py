@@ -1,7 +1,7 @@
-"""Any orders, cars, hands at the box and losses: the wire and the box are witnesses.
+"""Property: any orders, cars, use of the box and losses; the wire is the oracle.
 
-No set-point above what was ordered and allowed, none between 0 and the minimum, 0
-never, access never opened that somebody has closed, and in the end the order stands.
+No set-point is above the orders and limits or below the minimum, 0 is never written,
+access that was turned off at the box is never turned on, and in the end the order stands.
 """
 
 import asyncio
@@ -32,10 +32,10 @@ ACTS = st.one_of(
             ("leave", None),
             ("finish", None),
             ("request", None),
-            ("no at the box", None),
-            ("yes at the box", None),
+            ("access off", None),
+            ("access on", None),
             ("power failure", None),
-            ("override off", None),
+            ("override removed", None),
             ("another cable", 13),
             ("another cable", 32),
             ("error", 2),
@@ -51,25 +51,22 @@ STEPS = st.lists(
 
 
 @dataclass
-class Witness:
-    """What was said, and what on the wire contradicts it."""
+class Oracle:
+    """The orders given, and frames on the wire that contradict them."""
 
     scene: PolledScene
     limit: float = 10.0
     allowed: bool | None = None
-    started_at: float | None = None
-    """When the user, or a limit after a limit of 0 A, last let a car start."""
     ours: bool = False
-    """A limit of 0 A may have closed access."""
+    """A limit of 0 A may have turned access off."""
     broken: list[str] = field(default_factory=list)
 
-    def say(self, change: OrderChange) -> None:
+    def order(self, change: OrderChange) -> None:
         if change.allowed is not None:
             self.allowed = change.allowed
         if change.current is not None:
             self.ours = self.ours or change.current == 0 or self.limit == 0
             self.limit = change.current
-        self.started_at = now()
 
     def on_wire(self, data: bytes) -> None:
         write = as_write(now(), data)
@@ -78,11 +75,11 @@ class Witness:
         layout = MAPS[self.scene.dialect]
         if write.register == layout.access_register:
             if write.value and self.allowed is False:
-                self.broken.append("access opened against the user's no")
+                self.broken.append("access turned on against a pause by the user")
             if write.value and self.limit < MINIMUM_CURRENT:
-                self.broken.append("access opened against a limit of 0 A")
+                self.broken.append("access turned on against a limit of 0 A")
             if write.value and self.allowed is None and not self.ours:
-                self.broken.append("access opened that nobody of us had closed")
+                self.broken.append("access turned on that was turned off at the box")
         elif write.register == layout.current_register:
             self._on_current(write.value / 10)
         else:
@@ -92,7 +89,7 @@ class Witness:
         charger = self.scene.charger
         if amperes < MINIMUM_CURRENT:
             self.broken.append(f"{amperes} A written")
-        # 6 A is what a box is told while nobody may be told more.
+        # 6 A is written ahead of a car whatever the limit.
         ceiling = max(MINIMUM_CURRENT, min(self.limit, charger.limits.ceiling))
         if amperes > INSTALLATION:
             self.broken.append(f"{amperes} A in an installation for {INSTALLATION} A")
@@ -104,9 +101,9 @@ class Witness:
             self.broken.append(f"{amperes} A on a cable for {cable} A")
 
 
-async def act(scene: PolledScene, witness: Witness, what: str, value: object) -> None:
+async def act(scene: PolledScene, oracle: Oracle, what: str, value: object) -> None:
     if isinstance(value, OrderChange):
-        witness.say(value)
+        oracle.order(value)
         with suppress(EvseError):
             await scene.charger.change_orders(value)
     elif hasattr(scene.car, what):
@@ -118,13 +115,13 @@ async def act(scene: PolledScene, witness: Witness, what: str, value: object) ->
 def at_the_box(scene: PolledScene, what: str, value: object) -> None:
     outlet = scene.outlet
     match what:
-        case "no at the box":
+        case "access off":
             outlet.set_access(False)
-        case "yes at the box":
+        case "access on":
             outlet.set_access(True)
         case "power failure":
             scene.box.controller.power_cycle()
-        case "override off":
+        case "override removed":
             outlet.override = 0
         case "another cable" if not scene.car.plugged:
             assert isinstance(value, int)
@@ -136,11 +133,11 @@ def at_the_box(scene: PolledScene, what: str, value: object) -> None:
 
 async def play(
     dialect: Dialect, steps: list[tuple[float, tuple[str, object]]], seed: int
-) -> Witness:
+) -> Oracle:
     scene = PolledScene(
         dialect, current=10.0, installation=INSTALLATION, maximum=32, cable=32
     )
-    witness = Witness(scene)
+    oracle = Oracle(scene)
     rng = Random(seed)  # noqa: S311 - repeatable on purpose
     losing = True
     scene.box.loses = lambda _data: losing and rng.random() < 0.1
@@ -148,19 +145,19 @@ async def play(
     write = scene.line.write
 
     def watched(data: bytes, *, reply_may_equal: bool = False) -> float:
-        witness.on_wire(data)
+        oracle.on_wire(data)
         return write(data, reply_may_equal=reply_may_equal)
 
     scene.line.write = watched  # type: ignore[method-assign]
-    said: list[asyncio.Task[None]] = []
+    orders: list[asyncio.Task[None]] = []
     async with scene:
         for pause, (what, value) in steps:
             await asyncio.sleep(pause)
-            said.append(asyncio.create_task(act(scene, witness, what, value)))
+            orders.append(asyncio.create_task(act(scene, oracle, what, value)))
             await asyncio.sleep(0)
         losing = False
-        await asyncio.gather(*said)
-        # Long enough for a box that was given up to be found again.
+        await asyncio.gather(*orders)
+        # Long enough for an unavailable box to be found again.
         await asyncio.sleep(45 if dialect is not LATER else 60)
         assert scene.charger.available
         standing = scene.charger.setpoint
@@ -170,20 +167,20 @@ async def play(
         else:
             highest = max(standing.current, MINIMUM_CURRENT)
             if scene.box.offers > highest:
-                # A car begins with the box's own maximum, until its next cycle.
+                # A charge begins with the box's own maximum, until its next cycle.
                 await asyncio.sleep(15)
             assert scene.box.offers <= highest
-        assert scene.charger.orders.limit.current <= witness.limit
-        if witness.allowed is False:
+        assert scene.charger.orders.limit.current <= oracle.limit
+        if oracle.allowed is False:
             assert scene.charger.orders.allowed is False
-    return witness
+    return oracle
 
 
 @pytest.mark.parametrize("dialect", ALL)
 @given(steps=STEPS, seed=st.integers(0, 99))
 @settings(max_examples=15, deadline=None)
-def test_what_was_said_last_stands(
+def test_the_last_order_stands(
     dialect: Dialect, steps: list[tuple[float, tuple[str, object]]], seed: int
 ) -> None:
-    witness = simulate(play(dialect, steps, seed))
-    assert witness.broken == []
+    oracle = simulate(play(dialect, steps, seed))
+    assert oracle.broken == []
