@@ -22,7 +22,7 @@ from custom_components.evse_bus.evse.exchange import Turn
 from custom_components.evse_bus.evse.model import OrderChange, Persistence
 from tests.simulated_time import now, simulate
 
-from .simulated import TIMING, Device, Scene, SimulatedLine
+from .telegram import TIMING, Device, Scene, TelegramLine
 
 
 def test_polls_each_charger_at_its_interval() -> None:
@@ -626,7 +626,7 @@ def test_a_port_that_cannot_be_opened_is_told_at_the_start() -> None:
         bus.line.refuse_open = PortMissingError("no such file")
         with pytest.raises(PortMissingError):
             await bus.bus.start()
-        assert isinstance(bus.line, SimulatedLine)
+        assert isinstance(bus.line, TelegramLine)
         await bus.bus.stop()
 
     simulate(scene())

@@ -24,7 +24,7 @@ from custom_components.evse_bus.evse.statistics import (
 )
 from tests.simulated_time import simulate
 
-from .simulated import Scene, SimulatedCharger, SimulatedLine
+from .telegram import Scene, SimulatedCharger, TelegramLine
 
 
 class SlowCharger(SimulatedCharger):
@@ -105,7 +105,7 @@ def test_a_stop_ends_a_start_that_has_not_ended() -> None:
         bus = Scene()
         opened = asyncio.Event()
 
-        class SlowLine(SimulatedLine):
+        class SlowLine(TelegramLine):
             @override
             async def open(self) -> None:
                 await opened.wait()

@@ -20,7 +20,7 @@ from custom_components.evse_bus.evse.model import Fault, OrderChange
 from custom_components.evse_bus.evse.schedule import Kind
 from tests.simulated_time import now, simulate
 
-from .simulated import TIMING, Scene, SimulatedCharger, Telegram, TelegramFramer
+from .telegram import TIMING, Scene, SimulatedCharger, Telegram, TelegramFramer
 
 PERIOD = 2.0
 SLACK = 0.02

@@ -12,7 +12,7 @@ from custom_components.evse_bus.evse.errors import EvseError
 from custom_components.evse_bus.evse.model import OrderChange
 from tests.simulated_time import simulate
 
-from .simulated import Scene, SimulatedCharger
+from .telegram import Scene, SimulatedCharger
 from .test_bus_mishaps import SlowCharger
 
 CHANGES = st.one_of(

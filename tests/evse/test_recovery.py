@@ -11,11 +11,11 @@ from custom_components.evse_bus.evse.errors import LineLostError, PortMissingErr
 from custom_components.evse_bus.evse.recovery import PAUSES, SILENCES, LineRecovery
 from tests.simulated_time import now, simulate
 
-from .simulated import Device, Scene, SimulatedLine
+from .telegram import Device, Scene, TelegramLine
 from .test_master import PERIOD, BeatScene
 
 
-class Adapter(SimulatedLine):
+class Adapter(TelegramLine):
     """A network adapter that may hang, close idle connections, or be away."""
 
     def __init__(self, *devices: Device) -> None:

@@ -23,11 +23,12 @@ from custom_components.evse_bus.evse.model import (
     Orders,
 )
 from custom_components.evse_bus.evse.schedule import Kind
+from tests.evse.simulated_line import until
 from tests.simulated_time import now, simulate
 from tests.virtual import Car, EvboxChargePoint, Module
 from tests.virtual.evbox_frames import frame
 
-from .ether import ORDERS, Ether, Scene, until, updates
+from .scene import ORDERS, EvboxLine, Scene, updates
 
 SERIAL = 1923054
 
@@ -38,8 +39,8 @@ def box(*modules: Module, min_interval: int = 1) -> EvboxChargePoint:
     )
 
 
-def six(ether: Ether) -> list[bool]:
-    return [max(order.limits + order.fallback) <= 6.0 for order in ether.orders]
+def six(line: EvboxLine) -> list[bool]:
+    return [max(order.limits + order.fallback) <= 6.0 for order in line.orders]
 
 
 # -- Configuration -------------------------------------------------------------------
@@ -92,15 +93,15 @@ def test_from_the_first_request_to_the_reading() -> None:
             information = bytes(range(16))
             charger = stage.add(information=information)
             await until(lambda: charger.reading)
-            first = stage.ether.orders[0]
+            first = stage.line.orders[0]
             assert first.limits == first.fallback == (6.0, 6.0, 6.0)
             assert (first.command, first.timeout) == (68, 60)
             assert (first.serial, first.information) == ("01923054", information)
             assert charger.reading is not None
             assert charger.reading.maximum_current is None
             await asyncio.sleep(30.0)
-            assert six(stage.ether)[:3] == [True, True, False]
-            assert stage.ether.orders[-1].limits == (16.0, 16.0, 16.0)
+            assert six(stage.line)[:3] == [True, True, False]
+            assert stage.line.orders[-1].limits == (16.0, 16.0, 16.0)
             assert charger.setpoint.currents == (16.0, 16.0, 16.0)
             reading = charger.reading
             one, two = reading.connectors[1], reading.connectors[2]
@@ -141,7 +142,7 @@ def test_command_69_estimates_power() -> None:
             assert (one.power, one.voltage) == (None, (None, None, None))
             assert charger.info is not None
             assert charger.info.serial is None
-            assert {order.command for order in stage.ether.orders} == {69}
+            assert {order.command for order in stage.line.orders} == {69}
 
     simulate(scene())
 
@@ -152,11 +153,11 @@ def test_a_pause_is_0_a_on_all_phases_and_a_limit_does_not_end_it() -> None:
             charger = stage.add()
             await asyncio.sleep(10.0)
             await charger.change_orders(OrderChange(allowed=False))
-            assert stage.ether.orders[-1].limits == (0.0, 0.0, 0.0)
+            assert stage.line.orders[-1].limits == (0.0, 0.0, 0.0)
             await charger.change_orders(OrderChange(current=20.0))
-            assert stage.ether.orders[-1].limits == (0.0, 0.0, 0.0)
+            assert stage.line.orders[-1].limits == (0.0, 0.0, 0.0)
             await charger.change_orders(OrderChange(allowed=True))
-            assert stage.ether.orders[-1].limits == (20.0, 20.0, 20.0)
+            assert stage.line.orders[-1].limits == (20.0, 20.0, 20.0)
 
     simulate(scene())
 
@@ -175,7 +176,7 @@ def test_single_phases_and_the_fail_back() -> None:
                     fail_safe_timeout=90,
                 )
             )
-            order = stage.ether.orders[-1]
+            order = stage.line.orders[-1]
             assert order.limits == (20.0, 10.5, 0.0)
             assert order.fallback == (0.0, 8.0, 4.5)
             assert order.timeout == 90
@@ -190,11 +191,11 @@ def test_the_smallest_minimum_of_the_modules_counts() -> None:
             charger = stage.add(orders=Orders(limit=CurrentLimit(current=7.0)))
             await asyncio.sleep(10.0)
             assert charger.limits.minimum == 8.0
-            assert stage.ether.orders[-1].limits == (0.0, 0.0, 0.0)
+            assert stage.line.orders[-1].limits == (0.0, 0.0, 0.0)
             with pytest.raises(RefusedOrderError):
                 await charger.change_orders(OrderChange(current=7.0))
             await charger.change_orders(OrderChange(current=8.0))
-            assert stage.ether.orders[-1].limits == (8.0, 8.0, 8.0)
+            assert stage.line.orders[-1].limits == (8.0, 8.0, 8.0)
 
     simulate(scene())
 
@@ -208,7 +209,7 @@ def test_no_modules_and_twenty_modules() -> None:
             await asyncio.sleep(10.0)
             assert charger.reading is not None
             assert dict(charger.reading.connectors) == {}
-            assert stage.ether.orders[-1].limits == (16.0, 16.0, 16.0)
+            assert stage.line.orders[-1].limits == (16.0, 16.0, 16.0)
             for number in range(20):
                 point.add_module(Module(energy_wh=1000.0 * number))
             await asyncio.sleep(12.0)
@@ -257,11 +258,11 @@ def test_the_minimum_interval_is_kept_also_by_commands(interval: int) -> None:
             await asyncio.sleep(60.0)
             for current in range(6, 14):
                 await charger.change_orders(OrderChange(current=float(current)))
-                assert stage.ether.orders[-1].limits[0] == current
+                assert stage.line.orders[-1].limits[0] == current
                 await asyncio.sleep(0.3)
             assert charger.minimum_interval == interval
         # The first requests are sent before a minimum interval is known.
-        assert min(stage.ether.pauses()) >= max(interval, 0.2)
+        assert min(stage.line.pauses()) >= max(interval, 0.2)
         assert point.counters.too_soon == 0
 
     simulate(scene())
@@ -285,7 +286,7 @@ def test_the_period(poll: float, interval: int, timeout: int, period: float) -> 
         async with Scene.of(point) as stage:
             stage.add(poll_interval=poll, orders=orders)
             await asyncio.sleep(200.0)
-        assert stage.ether.pauses()[-5:] == pytest.approx(5 * [period], abs=0.2)
+        assert stage.line.pauses()[-5:] == pytest.approx(5 * [period], abs=0.2)
         assert (point.counters.fail_backs, point.counters.too_soon) == (0, 0)
         assert stage.bus.wire.statistics.missed_deadlines == 0
 
@@ -305,7 +306,7 @@ def test_a_time_out_below_three_intervals_is_raised(
             assert charger.effective_timeout == max(ordered, 60)
             await asyncio.sleep(100.0)
             assert charger.effective_timeout == sent
-            assert stage.ether.orders[-1].timeout == sent
+            assert stage.line.orders[-1].timeout == sent
             assert charger.reading is not None
             assert charger.reading.details["ordered_timeout"] == ordered
             assert charger.reading.details["effective_timeout"] == sent
@@ -336,8 +337,8 @@ def test_unanswered_requests_are_repeated_before_the_time_out() -> None:
             charger = stage.add(orders=replace(ORDERS, fail_safe_timeout=9))
             await asyncio.sleep(10.0)
             for _ in range(20):
-                stage.ether.faults.once("lose")
-                stage.ether.faults.once("lose")
+                stage.line.faults.once("lose")
+                stage.line.faults.once("lose")
                 await asyncio.sleep(10.0)
                 assert charger.available
         assert charger.statistics.timeouts >= 20
@@ -393,19 +394,19 @@ def test_after_an_absence_6_a_and_then_the_orders_that_stand() -> None:
         async with Scene.of(point) as stage:
             charger = stage.add()
             await asyncio.sleep(10.0)
-            assert not six(stage.ether)[-1]
+            assert not six(stage.line)[-1]
             point.faults.dead = True
             await until(lambda: not charger.available)
-            silent = len(stage.ether.sent)
+            silent = len(stage.line.sent)
             await asyncio.sleep(60.0)
             point.faults.dead = False
             point.power_cycle()
             await until(lambda: charger.available)
-            assert all(six(stage.ether)[silent:])
+            assert all(six(stage.line)[silent:])
             # No longer pause: it charges at its own maximum until a request comes.
-            assert max(stage.ether.pauses()) < 12.0
+            assert max(stage.line.pauses()) < 12.0
             await asyncio.sleep(5.0)
-            assert stage.ether.orders[-1].limits == (16.0, 16.0, 16.0)
+            assert stage.line.orders[-1].limits == (16.0, 16.0, 16.0)
 
     simulate(scene())
 
@@ -416,13 +417,13 @@ def test_after_a_lost_port_the_minimum_interval_is_kept() -> None:
         async with Scene.of(point) as stage:
             charger = stage.add()
             await asyncio.sleep(41.0)
-            sent = len(stage.ether.sent)
-            stage.ether.unplug()
+            sent = len(stage.line.sent)
+            stage.line.unplug()
             await asyncio.sleep(30.0)
-            assert stage.ether.is_open
+            assert stage.line.is_open
             assert charger.available
-            assert all(six(stage.ether)[sent:])
-        assert min(stage.ether.pauses()) >= 20.0
+            assert all(six(stage.line)[sent:])
+        assert min(stage.line.pauses()) >= 20.0
         assert point.counters.too_soon == 0
 
     simulate(scene())
@@ -433,11 +434,11 @@ def test_expired_orders_become_the_fail_safe() -> None:
         async with Scene.of(box()) as stage:
             charger = stage.add(order_lifetime=60.0)
             await asyncio.sleep(50.0)
-            assert stage.ether.orders[-1].limits == (16.0, 16.0, 16.0)
+            assert stage.line.orders[-1].limits == (16.0, 16.0, 16.0)
             await asyncio.sleep(20.0)
-            assert stage.ether.orders[-1].limits == (6.0, 6.0, 6.0)
+            assert stage.line.orders[-1].limits == (6.0, 6.0, 6.0)
             await charger.change_orders(OrderChange(current=16.0))
-            assert stage.ether.orders[-1].limits == (16.0, 16.0, 16.0)
+            assert stage.line.orders[-1].limits == (16.0, 16.0, 16.0)
 
     simulate(scene())
 
@@ -447,10 +448,10 @@ def test_expired_orders_stay_so_while_the_fail_safe_changes() -> None:
         async with Scene.of(box()) as stage:
             charger = stage.add(order_lifetime=60.0)
             await asyncio.sleep(70.0)
-            since = len(stage.ether.orders)
+            since = len(stage.line.orders)
             await charger.change_orders(OrderChange(fail_safe_current=8.0))
             await asyncio.sleep(70.0)
-            sent = [order.limits for order in stage.ether.orders[since:]]
+            sent = [order.limits for order in stage.line.orders[since:]]
             assert set(sent) == {(8.0, 8.0, 8.0)}
 
     simulate(scene())
@@ -539,7 +540,7 @@ def test_inconsistent_implausible_replies_make_it_unavailable() -> None:
             assert charger.reading is None
             assert Fault.IMPLAUSIBLE in charger.faults
             # It is there, so its orders are still sent, with 6 A at most.
-            assert six(stage.ether)[-1]
+            assert six(stage.line)[-1]
             assert point.counters.fail_backs == 0
             await asyncio.sleep(10.0)
             assert charger.available
@@ -592,7 +593,7 @@ def test_a_command_is_repeated_until_its_reply_is_accepted() -> None:
             await asyncio.sleep(10.0)
             point.distort(voltage=400.0, times=2)
             await charger.change_orders(OrderChange(current=20.0))
-            assert [order.limits[0] for order in stage.ether.orders[-3:]] == 3 * [20.0]
+            assert [order.limits[0] for order in stage.line.orders[-3:]] == 3 * [20.0]
             assert charger.orders.limit.current == 20.0
 
     simulate(scene())
@@ -612,7 +613,7 @@ def test_an_unanswered_command_fails_and_a_lowering_stands() -> None:
                 await charger.change_orders(OrderChange(current=8.0))
             point.faults.dead = False
             await asyncio.sleep(30.0)
-            assert stage.ether.orders[-1].limits == (8.0, 8.0, 8.0)
+            assert stage.line.orders[-1].limits == (8.0, 8.0, 8.0)
         with pytest.raises(NotAvailableError):
             await charger.change_orders(OrderChange(current=9.0))
 
@@ -635,7 +636,7 @@ def test_replies_of_other_chargepoints_are_ignored() -> None:
                 foreign = frame("A0806800000077000101F40000000000"[:22] + "00")
                 return foreign + frame("BCA001") + frame("A080690001015E00") + data
 
-            stage.ether.damage = add_other_frames
+            stage.line.damage = add_other_frames
             await asyncio.sleep(20.0)
             assert charger.reading == before
             assert charger.statistics.timeouts == 0
@@ -690,12 +691,12 @@ def test_a_swapped_box_gets_two_requests_of_6_a_and_no_more() -> None:
             await asyncio.sleep(10.0)
             assert charger.info is not None
             assert charger.info.serial == "1923054"
-            assert not six(stage.ether)[-1]
-            sent = len(stage.ether.sent)
+            assert not six(stage.line)[-1]
+            sent = len(stage.line.sent)
             # Switched off, replaced, and switched on again.
             point.faults.dead = True
             await until(lambda: not charger.available)
-            missed = len(stage.ether.sent) - sent
+            missed = len(stage.line.sent) - sent
             point.serial, point.faults.dead = "00000077", False
             with updates(charger) as calls:
                 await until(lambda: charger.faults)
@@ -706,10 +707,10 @@ def test_a_swapped_box_gets_two_requests_of_6_a_and_no_more() -> None:
             with pytest.raises(WrongChargerError) as error:
                 await charger.change_orders(OrderChange(current=10.0))
             assert (error.value.expected, error.value.found) == ("1923054", "77")
-            stage.ether.unplug()
+            stage.line.unplug()
             await asyncio.sleep(300.0)
-            assert len(stage.ether.sent) == sent + missed + 2
-            assert all(six(stage.ether)[-2:])
+            assert len(stage.line.sent) == sent + missed + 2
+            assert all(six(stage.line)[-2:])
             point.step()
             assert point.failed_back
 
@@ -722,11 +723,11 @@ def test_a_box_swapped_between_two_polls_gets_6_a() -> None:
         async with Scene.of(point) as stage:
             charger = stage.add(0)
             await asyncio.sleep(10.0)
-            sent = len(stage.ether.sent)
+            sent = len(stage.line.sent)
             point.serial = "00000077"
             await until(lambda: Fault.WRONG_CHARGER in charger.faults)
-            assert len(stage.ether.sent) == sent + 2
-            assert six(stage.ether)[-2:] == [False, True]
+            assert len(stage.line.sent) == sent + 2
+            assert six(stage.line)[-2:] == [False, True]
             assert charger.reading is None
 
     simulate(scene())
@@ -738,7 +739,7 @@ def test_the_configured_serial_number_counts() -> None:
             charger = stage.add(0, serial="77")
             await asyncio.sleep(60.0)
             assert charger.faults == {Fault.WRONG_CHARGER}
-            assert len(stage.ether.sent) == 2
+            assert len(stage.line.sent) == 2
             assert charger.reading is None
         async with Scene.of(box()) as stage:
             charger = stage.add(0, serial="01923054")
@@ -761,7 +762,7 @@ def test_one_corrupt_serial_number_stops_nothing() -> None:
             await asyncio.sleep(30.0)
             assert charger.available
             assert charger.faults == frozenset()
-            assert stage.ether.orders[-1].limits == (16.0, 16.0, 16.0)
+            assert stage.line.orders[-1].limits == (16.0, 16.0, 16.0)
 
     simulate(scene())
 

@@ -21,7 +21,7 @@ from tests.simulated_time import simulate
 from tests.virtual import Car, EvboxChargePoint, Module, Order
 from tests.virtual.evbox_frames import frame
 
-from .ether import Scene
+from .scene import Scene, Sent
 
 INSTALLATION = 25.0
 type Act = tuple[str, float]
@@ -71,7 +71,7 @@ class Trial:
             min_interval=self.interval,
         )
         self.scene = Scene.of(self.point)
-        self.scene.ether.watch = self.check
+        self.scene.line.on_sent = lambda sent: self.check(sent.order)
         orders = Orders(
             limit=CurrentLimit(current=self.current),
             fail_safe=CurrentLimit(current=self.fail_safe),
@@ -161,9 +161,9 @@ class Trial:
         self.point.faults.dead = False
 
     async def do_unplug(self, _value: float) -> None:
-        if self.scene.ether.is_open:
+        if self.scene.line.is_open:
             self.answered = 0
-            self.scene.ether.unplug()
+            self.scene.line.unplug()
 
     async def do_power_cycle(self, _value: float) -> None:
         self.point.power_cycle()
@@ -182,7 +182,7 @@ class Trial:
     async def run(self, acts: list[Act]) -> None:
         async with self.scene:
             # An upper bound: a reply that is lost on the way is counted too.
-            self.scene.ether.damage = self.count_answers
+            self.scene.line.damage = self.count_answers
             for name, value in acts:
                 await self.act(name, value)
             self.point.faults.dead = False
@@ -209,13 +209,13 @@ def test_no_sequence_of_events_puts_too_much_current_on_the_wire(
     trial = Trial(maximum, interval, seed)
     wrong: list[AssertionError] = []
 
-    def check(order: Order) -> None:
+    def check(sent: Sent) -> None:
         try:
-            trial.check(order)
+            trial.check(sent.order)
         except AssertionError as error:
             wrong.append(error)
 
-    trial.scene.ether.watch = check
+    trial.scene.line.on_sent = check
     simulate(trial.run(steps))
     assert not wrong, wrong[0]
     # Also after a power failure, and after a reply that was lost, although the library
@@ -225,7 +225,7 @@ def test_no_sequence_of_events_puts_too_much_current_on_the_wire(
     ceiling = min(INSTALLATION, maximum)
     ordered = min(trial.current, ceiling)
     expected = ordered if trial.allowed and ordered >= 6.0 else 0.0
-    last = trial.scene.ether.orders[-1]
+    last = trial.scene.line.orders[-1]
     assert last.limits[0] <= expected
 
 
@@ -250,14 +250,14 @@ def test_no_request_is_above_the_maximum_of_the_last_two_replies(
             reported.append(int(data[19:23], 16) / 10)
             return data
 
-        def check(order: Order) -> None:
-            highest = max(order.limits + order.fallback)
+        def check(sent: Sent) -> None:
+            highest = max(sent.order.limits + sent.order.fallback)
             allowed = min(reported[-2:]) if len(reported) > 1 else 6.0
             if highest > allowed:
                 wrong.append((highest, reported[-2:]))
 
         stage = Scene.of(point)
-        stage.ether.damage, stage.ether.watch = record, check
+        stage.line.damage, stage.line.on_sent = record, check
         async with stage:
             stage.add(
                 orders=Orders(
@@ -270,7 +270,7 @@ def test_no_request_is_above_the_maximum_of_the_last_two_replies(
                 await asyncio.sleep(wait)
             await asyncio.sleep(12.0)
         assert wrong == []
-        assert stage.ether.orders[-1].limits[0] == min(point.max_current, 32.0)
+        assert stage.line.orders[-1].limits[0] == min(point.max_current, 32.0)
 
     simulate(scene())
 
@@ -291,7 +291,7 @@ async def run_with_damage(
             damage_frame(out, rng)
         return bytes(out)
 
-    stage.ether.damage = damage
+    stage.line.damage = damage
     async with stage:
         charger = stage.add(poll_interval=1.0)
         shown = 0
@@ -357,7 +357,7 @@ def test_an_impossible_value_with_good_checksums_is_not_shown(seed: int) -> None
                 fake(out, rng)
             return bytes(out)
 
-        stage.ether.damage = damage
+        stage.line.damage = damage
         async with stage:
             charger = stage.add(poll_interval=1.0)
             for _ in range(300):
@@ -389,13 +389,13 @@ def test_unusable_values_are_refused_before_anything_is_sent(
         async with Scene.of(EvboxChargePoint(1923054)) as stage:
             charger = stage.add()
             await asyncio.sleep(3.0)
-            before = (charger.orders, len(stage.ether.sent))
+            before = (charger.orders, len(stage.line.sent))
             try:
                 await charger.change_orders(OrderChange(**change))  # type: ignore[arg-type]
             except RefusedOrderError:
                 pass
             else:
                 raise AssertionError("it was accepted")
-            assert (charger.orders, len(stage.ether.sent)) == before
+            assert (charger.orders, len(stage.line.sent)) == before
 
     simulate(scene())

@@ -14,7 +14,7 @@ from tests.simulated_time import now, simulate
 from tests.virtual import EvboxChargePoint, Module
 from tests.virtual.evbox_frames import frame
 
-from .ether import ORDERS, Scene
+from .scene import ORDERS, Scene
 
 ANY = EvboxConfig(key="scan", name="scan", address=0, installation_limit=32.0)
 CONFIRMED = Orders(
@@ -47,7 +47,7 @@ def test_the_only_box_on_the_line() -> None:
             assert (one.maximum_current, one.connectors) == (25.0, 3)
             assert (report.duplicates, report.unreadable) == ((), False)
             assert now() - started < 1.5
-            (order,) = stage.ether.orders
+            (order,) = stage.line.orders
             assert order.serial == "00000000"
             assert order.limits == (6.0, 0.0, 6.0)
             assert order.fallback == (4.0, 4.0, 3.5)
@@ -60,7 +60,7 @@ def test_a_pause_is_sent_as_a_pause() -> None:
     async def scene() -> None:
         async with Scene.of(EvboxChargePoint(5)) as stage:
             await find(stage, orders=replace(CONFIRMED, allowed=False))
-            assert stage.ether.orders[0].limits == (0.0, 0.0, 0.0)
+            assert stage.line.orders[0].limits == (0.0, 0.0, 0.0)
 
     simulate(scene())
 
@@ -124,14 +124,14 @@ def test_unreadable_replies(
 ) -> None:
     async def scene() -> None:
         async with Scene.of(EvboxChargePoint(11, min_interval=20)) as stage:
-            stage.ether.damage = damage
+            stage.line.damage = damage
             report, _ = await find(stage)
             assert (report.found, report.duplicates) == ((), duplicates)
             assert report.unreadable
             # The box has received the first probe: the second is not too soon.
-            assert len(stage.ether.sent) == 2
-            assert stage.ether.pauses()[0] >= 20.0
-            assert stage.ether.points[0].counters.too_soon == 0
+            assert len(stage.line.sent) == 2
+            assert stage.line.pauses()[0] >= 20.0
+            assert stage.line.points[0].counters.too_soon == 0
             # A typed number addresses one box, so the line must be bad.
             report, _ = await find(stage, replace(ANY, address=11))
             assert (report.duplicates, report.unreadable) == ((), True)
@@ -191,7 +191,7 @@ def test_replies_of_other_boxes_are_ignored() -> None:
             other_replies = frame("A080690001015E00") + frame(
                 "A08068000000770001015E00"
             )
-            stage.ether.damage = lambda data: other_replies + data
+            stage.line.damage = lambda data: other_replies + data
             report, _ = await find(stage, replace(ANY, address=11))
             assert [one.address for one in report.found] == [11]
 
@@ -209,7 +209,7 @@ def test_a_search_does_not_set_the_limits_of_boxes_in_use() -> None:
                 await find(stage, replace(ANY, address=12, command=69))
             report, _ = await find(stage, replace(ANY, address=12))
             assert [one.address for one in report.found] == [12]
-        assert {order.serial for order in stage.ether.orders} == {
+        assert {order.serial for order in stage.line.orders} == {
             "00000011",
             "00000012",
         }
@@ -223,7 +223,7 @@ def test_orders_that_cannot_be_sent_are_refused() -> None:
             orders = replace(ORDERS, limit=CurrentLimit(current=float("nan")))
             with pytest.raises(RefusedOrderError):
                 await find(stage, orders=orders)
-            assert stage.ether.sent == []
+            assert stage.line.sent == []
 
     simulate(scene())
 
@@ -234,7 +234,7 @@ def test_a_line_that_is_always_busy_raises() -> None:
 
             async def send_forever() -> None:
                 while True:
-                    stage.ether.foreign(b"\x55")
+                    stage.line.foreign(b"\x55")
                     await asyncio.sleep(0.05)
 
             sending = asyncio.create_task(send_forever())
@@ -242,6 +242,6 @@ def test_a_line_that_is_always_busy_raises() -> None:
             with pytest.raises(LineBusyError):
                 await find(stage)
             sending.cancel()
-            assert stage.ether.sent == []
+            assert stage.line.sent == []
 
     simulate(scene())

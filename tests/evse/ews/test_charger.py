@@ -18,7 +18,7 @@ from custom_components.evse_bus.evse.model import (
     Status,
 )
 
-from .ether import SERIAL, EwsScene, now, play, simulate
+from .scene import SERIAL, EwsScene, now, play, simulate
 
 ON = OrderChange(allowed=True)
 OFF = OrderChange(allowed=False)
@@ -106,7 +106,7 @@ def test_a_scan_finds_the_box_and_writes_nothing(
     async def run() -> None:
         known = {"bcc": "without_msgid", "max_current": 20}
         scene = EwsScene(ports=(), options=known | options)
-        life = asyncio.create_task(scene._live())
+        life = asyncio.create_task(scene.live())
         await scene.bus.start()
         done: list[float] = []
         config = scene.make_charger(1).config

@@ -7,7 +7,7 @@ import pytest
 from custom_components.evse_bus.evse.ews.timing import TCP_TIMING
 
 from .dialling import dialling, expected, has_reading, run, server, until
-from .ether import EwsScene, play
+from .scene import EwsScene, play
 
 
 @pytest.mark.parametrize("silence", [15.0, 40.0, 100.0, 200.0])

@@ -22,7 +22,7 @@ from custom_components.evse_bus.evse.model import Command, OrderChange
 from tests.virtual.ews_rfid import Card as VirtualCard
 from tests.virtual.ews_session import Session
 
-from .ether import EwsScene, play
+from .scene import EwsScene, play
 from .wire import PORTS
 
 ON = OrderChange(allowed=True)

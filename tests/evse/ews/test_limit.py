@@ -19,7 +19,7 @@ from custom_components.evse_bus.evse.model import (
 from tests.virtual.ews_box import EwsBox as VirtualBox
 from tests.virtual.ews_commands import COMMANDS
 
-from .ether import EwsScene, now, play, simulate
+from .scene import EwsScene, now, play, simulate
 
 ON = OrderChange(allowed=True)
 OFF = OrderChange(allowed=False)

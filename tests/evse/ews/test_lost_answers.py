@@ -17,7 +17,7 @@ from custom_components.evse_bus.evse.ews.port import BoxPorts
 from custom_components.evse_bus.evse.ews.wire.answers import EwsRefusedError, Refusal
 from custom_components.evse_bus.evse.model import Fault, OrderChange, Status
 
-from .ether import EwsScene, now, play
+from .scene import EwsScene, now, play
 
 ON = OrderChange(allowed=True)
 OFF = OrderChange(allowed=False)

@@ -8,7 +8,7 @@ from custom_components.evse_bus.evse.errors import NotAvailableError
 from custom_components.evse_bus.evse.ews.timing import TCP_TIMING
 from custom_components.evse_bus.evse.model import Command, Fault, OrderChange
 
-from .ether import EwsScene, now, simulate
+from .scene import EwsScene, now, simulate
 from .test_times import longest_silence
 
 

@@ -13,7 +13,7 @@ from hypothesis import given, settings, strategies as st
 from custom_components.evse_bus.evse.errors import EvseError
 from custom_components.evse_bus.evse.model import Command, OrderChange
 
-from .ether import EwsScene, now, play
+from .scene import EwsScene, now, play
 
 WAITS = st.sampled_from((0.0, 0.05, 0.3, 1.0, 3.0, 8.0))
 ACTS = st.one_of(

@@ -17,7 +17,7 @@ from custom_components.evse_bus.evse.ews.wire.states import STATES
 from custom_components.evse_bus.evse.ews.wire.status import ChargeResult
 from custom_components.evse_bus.evse.model import OrderChange, Status
 
-from .ether import EwsScene, now, play
+from .scene import EwsScene, now, play
 
 ON = OrderChange(allowed=True)
 OFF = OrderChange(allowed=False)

@@ -24,7 +24,7 @@ from custom_components.evse_bus.evse.model import (
 )
 from tests.virtual.ews_rfid import Card
 
-from .ether import EwsScene, now, play, simulate
+from .scene import EwsScene, now, play, simulate
 
 ON = OrderChange(allowed=True)
 OFF = OrderChange(allowed=False)

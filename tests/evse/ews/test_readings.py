@@ -23,7 +23,7 @@ from custom_components.evse_bus.evse.model import Capability, SessionResult
 from custom_components.evse_bus.evse.readings import ConnectorReading
 from tests.virtual.ews_rfid import Card as VirtualCard
 
-from .ether import EwsScene, play
+from .scene import EwsScene, play
 from .wire import BOX, DETAILS, PORTS
 
 MODE_3 = {

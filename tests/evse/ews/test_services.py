@@ -35,7 +35,7 @@ from custom_components.evse_bus.evse.ews.wire.parameters import (
 from tests.virtual.ews_parameters import SystemParameters as VirtualParameters
 from tests.virtual.ews_rfid import Card
 
-from .ether import EwsScene, play
+from .scene import EwsScene, play
 
 
 def test_a_card_is_accepted() -> None:

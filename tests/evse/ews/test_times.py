@@ -13,7 +13,7 @@ from custom_components.evse_bus.evse.model import (
     Status,
 )
 
-from .ether import EwsScene, now, play
+from .scene import EwsScene, now, play
 
 ON = OrderChange(allowed=True)
 OFF = OrderChange(allowed=False)

@@ -13,7 +13,7 @@ from hypothesis import given, settings, strategies as st
 from custom_components.evse_bus.evse.errors import EvseError
 from custom_components.evse_bus.evse.model import Command, OrderChange
 
-from .ether import EwsScene, play
+from .scene import EwsScene, play
 
 JUMPER = 32
 START, WAITING = 3, 0x30

@@ -31,7 +31,7 @@ from custom_components.evse_bus.evse.model import (
 from tests.virtual import ews_commands
 from tests.virtual.ews_records import InfoMix
 
-from .ether import EwsScene, now, play
+from .scene import EwsScene, now, play
 from .wire import PORTS
 
 ON = OrderChange(allowed=True)

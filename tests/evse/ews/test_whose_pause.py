@@ -10,7 +10,7 @@ from custom_components.evse_bus.evse.errors import EvseError
 from custom_components.evse_bus.evse.ews.port import BoxPorts
 from custom_components.evse_bus.evse.model import CurrentLimit, OrderChange, Orders
 
-from .ether import EwsScene, now, play
+from .scene import EwsScene, now, play
 
 ON = OrderChange(allowed=True)
 OFF = OrderChange(allowed=False)

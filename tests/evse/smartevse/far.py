@@ -5,7 +5,7 @@ from random import Random
 from typing import override
 
 from custom_components.evse_bus.evse.errors import LineLostError
-from tests.evse.smartevse.ether import BYTE, Ether
+from tests.evse.smartevse.scene import BYTE, SmartEvseLine
 from tests.simulated_time import now
 
 MERGES = 0.003
@@ -14,7 +14,7 @@ SPIKES = 0.004
 """Part of the bytes that have another delay."""
 
 
-class FarEther(Ether):
+class FarLine(SmartEvseLine):
     """Both ways have a delay, and some bytes up to ``jitter`` more, s."""
 
     def __init__(self, delay: float, jitter: float, dice: Random) -> None:
@@ -47,7 +47,7 @@ class FarEther(Ether):
             super().write(data)
 
     @override
-    def _hear(self, data: bytes) -> None:
+    def hear(self, data: bytes) -> None:
         if now() > self._lost_until:
             self._back = self._late(self._back)
             asyncio.get_running_loop().call_at(self._back, self._arrive_here, data)

@@ -2,9 +2,8 @@
 
 import asyncio
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Self
+from typing import override
 
 from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.model import CurrentLimit, Orders
@@ -13,11 +12,12 @@ from custom_components.evse_bus.evse.smartevse import POLLED
 from custom_components.evse_bus.evse.smartevse.config import PolledConfig
 from custom_components.evse_bus.evse.smartevse.dialects import MAPS, Dialect
 from custom_components.evse_bus.evse.smartevse.polled import QUIET, PolledSmartEvse
-from tests.simulated_time import now, simulate
+from tests.evse.simulated_line import LiveScene
+from tests.simulated_time import simulate
 from tests.virtual import Car, SmartEvseController
 from tests.virtual.smartevse_registers import DIALECTS
 
-from .ether import STEP, Box, Ether
+from .scene import Box, SmartEvseLine
 
 ALL = tuple(Dialect)
 OLDER = (Dialect.V2_17, Dialect.V2_20)
@@ -37,7 +37,7 @@ class Write:
 
 
 @dataclass
-class PolledScene:
+class PolledScene(LiveScene):
     """One box, its car, and the library."""
 
     dialect: Dialect = V2_17
@@ -56,7 +56,7 @@ class PolledScene:
     poll_interval: float = 2.0
     settings: dict[str, int] = field(default_factory=dict)
     override_works: bool = True
-    line: Ether = field(init=False)
+    line: SmartEvseLine = field(init=False)
     car: Car = field(init=False)
     box: Box = field(init=False)
     charger: PolledSmartEvse = field(init=False)
@@ -64,14 +64,13 @@ class PolledScene:
     """Called at each step of the simulated time."""
 
     def __post_init__(self) -> None:
-        self.line = Ether()
+        self.line = SmartEvseLine()
         self.car = Car(max_current=32.0)
         self.box = self.make_box(self.dialect)
         self.line.boxes[0] = self.box
         self.bus = Bus(self.line, POLLED.framer(), POLLED.timing, "simulated")
         self.charger = self.make_charger()
         self.bus.add(self.charger)
-        self._life: asyncio.Task[None] | None = None
 
     def make_box(self, dialect: Dialect) -> Box:
         controller = SmartEvseController(
@@ -153,14 +152,6 @@ class PolledScene:
 
     # -- Time ----------------------------------------------------------------------
 
-    async def until(self, what: Callable[[], object], patience: float = 60.0) -> float:
-        """Wait for something; return how long it took."""
-        begin = now()
-        while not what():
-            assert now() - begin < patience, "it never happened"
-            await asyncio.sleep(STEP)
-        return now() - begin
-
     async def settled(self) -> None:
         """Wait until it is known and has nothing more to say."""
         await self.until(
@@ -185,24 +176,11 @@ class PolledScene:
         pause = max(self.poll_interval, QUIET if self.dialect is LATER else 0.0)
         await asyncio.sleep(times * (pause + 0.5))
 
-    async def _live(self) -> None:
-        while True:
-            self.line.live()
-            for look in self.seen:
-                look()
-            await asyncio.sleep(STEP)
-
-    async def __aenter__(self) -> Self:
-        self._life = asyncio.create_task(self._live())
-        await self.bus.start()
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        await self.bus.stop()
-        if self._life is not None:
-            self._life.cancel()
-            with suppress(asyncio.CancelledError):
-                await self._life
+    @override
+    def step(self) -> None:
+        self.line.live()
+        for look in self.seen:
+            look()
 
 
 def as_write(when: float, data: bytes) -> Write | None:

@@ -16,7 +16,7 @@ from custom_components.evse_bus.evse.smartevse.master import (
 )
 from custom_components.evse_bus.evse.smartevse.reader import TIMING
 from custom_components.evse_bus.evse.smartevse.sharing import STOPS_ALONE
-from tests.evse.smartevse.ether import Box, MasterScene, Sent
+from tests.evse.smartevse.scene import Box, MasterScene, Sent
 from tests.simulated_time import now, simulate
 
 GARBAGE = bytes(range(1, 40))

@@ -14,8 +14,8 @@ from custom_components.evse_bus.evse.model import (
     Persistence,
 )
 from custom_components.evse_bus.evse.smartevse.master import ECHO, PERIOD
-from tests.evse.smartevse.ether import MasterScene
-from tests.evse.smartevse.far import FarEther
+from tests.evse.smartevse.far import FarLine
+from tests.evse.smartevse.scene import MasterScene
 from tests.evse.smartevse.test_master_others import FOREIGN
 from tests.evse.smartevse.test_master_requests import ASKS, answers, frame
 from tests.simulated_time import SimulatedLoop, now, simulate
@@ -120,7 +120,7 @@ def test_a_slow_network_port(delay: float, jitter: float) -> None:
     async def scene() -> None:
         dice = Random(3)  # noqa: S311 - the same each time
         scene = MasterScene(units=(), limit=25.0, maximum=32)
-        scene.line = FarEther(delay, jitter, dice)
+        scene.line = FarLine(delay, jitter, dice)
         scene.new_bus()
         for unit in (2, 3, 4):
             scene.plug_box(unit)

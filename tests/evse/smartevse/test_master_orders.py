@@ -13,7 +13,7 @@ from custom_components.evse_bus.evse.model import (
     Status,
 )
 from custom_components.evse_bus.evse.smartevse.slave import WITHHELD_FOR
-from tests.evse.smartevse.ether import MasterScene
+from tests.evse.smartevse.scene import MasterScene
 from tests.simulated_time import now, simulate
 
 OFF = "021000a7000102000"

@@ -10,7 +10,7 @@ from custom_components.evse_bus.evse.model import Circuit, Fault, OrderChange
 from custom_components.evse_bus.evse.scan import ScanResult
 from custom_components.evse_bus.evse.smartevse import MASTER
 from custom_components.evse_bus.evse.smartevse.master import STAY_SILENT, Master
-from tests.evse.smartevse.ether import MasterScene
+from tests.evse.smartevse.scene import MasterScene
 from tests.simulated_time import now, simulate
 
 FOREIGN = bytes.fromhex("001000010004080064003c00000000ff7a")

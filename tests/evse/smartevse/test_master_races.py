@@ -11,7 +11,7 @@ from custom_components.evse_bus.evse.model import (
     Fault,
     OrderChange,
 )
-from tests.evse.smartevse.ether import MasterScene
+from tests.evse.smartevse.scene import MasterScene
 from tests.evse.smartevse.test_master_requests import ASKS, answers
 from tests.simulated_time import now, simulate
 

@@ -6,7 +6,7 @@ import pytest
 
 from custom_components.evse_bus.evse.model import OrderChange
 from custom_components.evse_bus.evse.smartevse.master import PERIOD
-from tests.evse.smartevse.ether import MasterScene, Sent
+from tests.evse.smartevse.scene import MasterScene, Sent
 from tests.simulated_time import now, simulate
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, override
 
 from custom_components.evse_bus.evse.model import OrderChange
-from tests.evse.smartevse.ether import Box, Ether, MasterScene
+from tests.evse.smartevse.scene import Box, MasterScene, SmartEvseLine
 from tests.simulated_time import now, simulate
 from tests.virtual.smartevse_frames import values_frame
 
@@ -26,7 +26,7 @@ SETTINGS = {
 }
 
 
-class Recording(Ether):
+class Recording(SmartEvseLine):
     """A line with the recorded slave."""
 
     def __init__(self) -> None:

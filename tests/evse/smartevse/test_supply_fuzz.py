@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 
 from custom_components.evse_bus.evse.errors import EvseError
 from custom_components.evse_bus.evse.model import Circuit, OrderChange
-from tests.evse.smartevse.ether import Box, MasterScene
+from tests.evse.smartevse.scene import Box, MasterScene
 from tests.simulated_time import simulate
 
 UNITS = (2, 3, 4)

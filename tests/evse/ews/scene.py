@@ -2,13 +2,10 @@
 
 import asyncio
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from random import Random
 from typing import Any, Self, override
 
 from custom_components.evse_bus.evse.bus import Bus
-from custom_components.evse_bus.evse.errors import LineLostError
 from custom_components.evse_bus.evse.ews import PROTOCOL
 from custom_components.evse_bus.evse.ews.charger import EwsPort
 from custom_components.evse_bus.evse.ews.config import EwsPortConfig
@@ -16,49 +13,17 @@ from custom_components.evse_bus.evse.ews.events import Event
 from custom_components.evse_bus.evse.ews.port import BoxPorts
 from custom_components.evse_bus.evse.ews.timing import SETTINGS
 from custom_components.evse_bus.evse.framing import Timing
-from custom_components.evse_bus.evse.line import Line
 from custom_components.evse_bus.evse.model import CurrentLimit, OrderChange, Orders
 from custom_components.evse_bus.evse.readings import ChargerReading, ConnectorReading
+from tests.evse.simulated_line import LiveScene, SimulatedLine
 from tests.simulated_time import now, simulate
 from tests.virtual import Car
 from tests.virtual.ews_box import EwsBox as VirtualBox
-from tests.virtual.faults import Faults
 from tests.virtual.log import CLIENT
 from tests.virtual.wire import Segment
 
 BYTE = SETTINGS.byte_time
-STEP = 0.02
 SERIAL = "012345678901"
-
-
-class Outside:
-    """What a virtual box wants of its bus, in simulated time."""
-
-    def __init__(self, line: Ether) -> None:
-        self._line = line
-        self.faults = Faults()
-        self.rng = Random(1)  # noqa: S311 - repeatable on purpose
-        self.byte_time = BYTE
-
-    @property
-    def loop(self) -> asyncio.AbstractEventLoop:
-        return asyncio.get_running_loop()
-
-    def time(self) -> float:
-        return now()
-
-    def now(self) -> float:
-        return now()
-
-    def call[T](self, function: Callable[[], T]) -> T:
-        return function()
-
-    def send_at(self, _device: object, data: bytes, at: float) -> None:
-        loop = self.loop
-        if at <= loop.time():
-            self._line.say(data)
-        else:
-            loop.call_at(at, self._line.say, data)
 
 
 @dataclass(frozen=True)
@@ -70,12 +35,11 @@ class Sent:
     parameters: bytes
 
 
-class Ether(Line):
+class EwsLine(SimulatedLine[Sent]):
     """A wire for each direction; what is not heard can be chosen."""
 
     def __init__(self) -> None:
-        super().__init__("simulated", SETTINGS)
-        self.sent: list[Sent] = []
+        super().__init__(SETTINGS)
         self.box: VirtualBox | None = None
         self.deaf: Callable[[str], bool] = lambda _name: False
         """The box does not hear a command."""
@@ -84,64 +48,37 @@ class Ether(Line):
         self.cut = False
         """Nothing passes."""
         self.held_until = 0.0
-        """What the box says before this time arrives then, in its order."""
+        """Bytes that the box sends before this time arrive then, in their order."""
         self.lumps = 1
-        """Bytes that arrive at once."""
-        self._open = False
-        self._name = ""
         self._free_at = 0.0
 
-    @property
     @override
-    def is_open(self) -> bool:
-        return self._open
-
-    @override
-    async def open(self) -> None:
-        self._open = True
-        self.statistics.opened += 1
+    def record(self, data: bytes, end: float) -> Sent:
+        return Sent(now(), data[4:6].decode(), data[6:-1])
 
     @override
-    async def close(self) -> None:
-        self._open = False
+    def carry(self, data: bytes, end: float) -> None:
+        if not self.deaf(data[4:6].decode()) and not self.cut:
+            self.loop.call_at(end, self._reach_box, data)
 
-    def unplug(self) -> None:
-        self._open = False
-        self.on_lost(LineLostError("unplugged"))
-
-    @override
-    def write(self, data: bytes, *, reply_may_equal: bool = False) -> float:
-        if not self._open:
-            raise LineLostError("not open")
-        name = data[4:6].decode()
-        self.sent.append(Sent(now(), name, data[6:-1]))
-        end = now() + len(data) * BYTE
-        if not self.deaf(name) and not self.cut:
-            asyncio.get_running_loop().call_at(end, self._heard, name, data)
-        return end
-
-    def _heard(self, name: str, data: bytes) -> None:
+    def _reach_box(self, data: bytes) -> None:
         assert self.box is not None
-        self._name = name
         end = now()
         self.box.receive(Segment(end - len(data) * BYTE, BYTE, data, (CLIENT,), end))
 
+    def send_at(self, _device: object, data: bytes, at: float) -> None:
+        """Send bytes of the box at that time, or as soon as it has passed."""
+        if at <= now():
+            self.say(data)
+        else:
+            self.loop.call_at(at, self.say, data)
+
     def say(self, data: bytes) -> None:
-        """Let the box send bytes: one after the other."""
+        """Let the box send bytes, after those it is still sending."""
         is_answer = data[3:4] == b"A"
         if self.cut or (is_answer and self.mute(data[4:6].decode("latin-1"))):
             return
-        loop = asyncio.get_running_loop()
-        begin = max(now(), self._free_at, self.held_until)
-        self._free_at = begin + len(data) * BYTE
-        size = self.lumps if self.lumps > 0 else len(data)
-        for at in range(0, len(data), size):
-            lump = data[at : at + size]
-            loop.call_at(begin + (at + len(lump)) * BYTE, self._arrive, lump)
-
-    def _arrive(self, data: bytes) -> None:
-        if self._open:
-            self.on_data(data)
+        self._free_at = self.deliver(data, max(now(), self._free_at, self.held_until))
 
     def named(self, *names: str, since: float = 0.0) -> list[Sent]:
         return [one for one in self.sent if one.name in names and one.when >= since]
@@ -163,7 +100,7 @@ class Ether(Line):
 
 
 @dataclass
-class EwsScene:
+class EwsScene(LiveScene):
     """One box, two cars, and the library."""
 
     current: float = 16.0
@@ -177,7 +114,7 @@ class EwsScene:
     config: dict[str, Any] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
     """Of the virtual box."""
-    line: Ether = field(init=False)
+    line: EwsLine = field(init=False)
     box: VirtualBox = field(init=False)
     cars: tuple[Car, Car] = field(init=False)
     events: list[Event] = field(default_factory=list)
@@ -185,19 +122,18 @@ class EwsScene:
     """Called at each step of the simulated time."""
 
     def __post_init__(self) -> None:
-        self.line = Ether()
+        self.line = EwsLine()
         self.cars = (Car(max_current=32.0), Car(max_current=32.0))
         self.bus = Bus(
             self.line, PROTOCOL.framer(), self.timing, "simulated", group=BoxPorts()
         )
         for port in self.ports:
             self.bus.add(self.make_charger(port))
-        self._life: asyncio.Task[None] | None = None
         self.box = self.make_box()
 
     def make_box(self, serial: str = SERIAL) -> VirtualBox:
         box = VirtualBox(serial=serial, cars=self.cars, **self.options)
-        box.bus = Outside(self.line)  # type: ignore[assignment]
+        box.bus = self.line  # type: ignore[assignment]
         self.line.box = box
         return box
 
@@ -249,14 +185,6 @@ class EwsScene:
 
     # -- Time ----------------------------------------------------------------------
 
-    async def until(self, what: Callable[[], object], patience: float = 60.0) -> float:
-        """Wait for something; return how long it took."""
-        begin = now()
-        while not what():
-            assert now() - begin < patience, "it never happened"
-            await asyncio.sleep(STEP)
-        return now() - begin
-
     async def settled(self) -> None:
         """Wait until all is known, and nothing more is to be said."""
         await self.until(
@@ -280,25 +208,17 @@ class EwsScene:
         await self.until(lambda: self.status(port) == 0x40)
         await asyncio.sleep(2.5)
 
-    async def _live(self) -> None:
-        while True:
-            self.box.step()
-            for look in self.seen:
-                look()
-            await asyncio.sleep(STEP)
+    @override
+    def step(self) -> None:
+        self.box.step()
+        for look in self.seen:
+            look()
 
+    @override
     async def __aenter__(self) -> Self:
-        self._life = asyncio.create_task(self._live())
-        await self.bus.start()
+        await super().__aenter__()
         self.charger(self.ports[0]).box.events.subscribe(self.events.append)
         return self
-
-    async def __aexit__(self, *_: object) -> None:
-        await self.bus.stop()
-        if self._life is not None:
-            self._life.cancel()
-            with suppress(asyncio.CancelledError):
-                await self._life
 
 
 def play(scene: EwsScene, acts: Callable[[EwsScene], object]) -> EwsScene:

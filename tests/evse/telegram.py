@@ -1,6 +1,5 @@
 """A bus in simulated time: no byte moves and no second passes for real."""
 
-import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import ClassVar, Self, override
@@ -8,7 +7,6 @@ from typing import ClassVar, Self, override
 from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.charger import Charger
 from custom_components.evse_bus.evse.conversation import FollowUp
-from custom_components.evse_bus.evse.errors import LineLostError
 from custom_components.evse_bus.evse.exchange import Turn
 from custom_components.evse_bus.evse.framing import (
     Frame,
@@ -16,7 +14,6 @@ from custom_components.evse_bus.evse.framing import (
     LineSettings,
     Timing,
 )
-from custom_components.evse_bus.evse.line import Line
 from custom_components.evse_bus.evse.model import (
     Capability,
     ChargerConfig,
@@ -27,6 +24,7 @@ from custom_components.evse_bus.evse.model import (
 )
 from custom_components.evse_bus.evse.readings import ChargerReading
 from custom_components.evse_bus.evse.safety import clamp
+from tests.evse.simulated_line import SimulatedLine
 from tests.simulated_time import now
 
 SETTINGS = LineSettings(baudrate=38400)
@@ -104,53 +102,22 @@ class Sent:
     value: int
 
 
-class SimulatedLine(Line):
+class TelegramLine(SimulatedLine[Sent]):
     """Devices and a wire that takes its time."""
 
     def __init__(self, *devices: Device) -> None:
-        super().__init__("simulated", SETTINGS)
+        super().__init__(SETTINGS)
         self.devices = {device.address: device for device in devices}
-        self.sent: list[Sent] = []
-        self.refuse_open: Exception | None = None
-        self._open = False
-
-    @property
-    @override
-    def is_open(self) -> bool:
-        return self._open
 
     @override
-    async def open(self) -> None:
-        if self.refuse_open is not None:
-            raise self.refuse_open
-        self._open = True
-        self.last_activity = now()
+    def record(self, data: bytes, end: float) -> Sent:
+        return Sent(now(), data[1], chr(data[2]), data[3])
 
     @override
-    async def close(self) -> None:
-        self._open = False
-
-    def unplug(self) -> None:
-        self._open = False
-        self.on_lost(LineLostError("unplugged"))
-
-    @override
-    def write(self, data: bytes, *, reply_may_equal: bool = False) -> float:
-        if not self._open:
-            raise LineLostError("not open")
-        self.sent.append(Sent(now(), data[1], chr(data[2]), data[3]))
-        end = now() + len(data) * SETTINGS.byte_time
-        self.last_activity = end
+    def carry(self, data: bytes, end: float) -> None:
         device = self.devices.get(data[1])
         if device is not None and (reply := device.reply(data)) is not None:
-            at = end + device.delay + len(reply) * SETTINGS.byte_time
-            asyncio.get_running_loop().call_at(at, self.hear, reply)
-        return end
-
-    def hear(self, data: bytes) -> None:
-        if self._open:
-            self.last_activity = max(self.last_activity, now())
-            self.on_data(data)
+            self.deliver(reply, end + device.delay)
 
     def times(self, address: int, command: str = "R") -> list[float]:
         return [
@@ -257,11 +224,11 @@ class Scene:
     keep_alive: float | None = None
     minimum_interval: float = 0.0
     lifetime: float | None = None
-    line: SimulatedLine = field(init=False)
+    line: TelegramLine = field(init=False)
     bus: Bus = field(init=False)
 
     def __post_init__(self) -> None:
-        self.line = SimulatedLine(*(Device(address) for address in self.addresses))
+        self.line = TelegramLine(*(Device(address) for address in self.addresses))
         self.bus = Bus(self.line, TelegramFramer(), TIMING, "simulated")
         for address in self.addresses:
             self.bus.add(self.make(address))

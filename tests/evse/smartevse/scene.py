@@ -4,30 +4,26 @@ The boxes are virtual ones, in simulated time; who overlaps on the wire is not h
 The witness is what the boxes offer with their contactors closed.
 """
 
-import asyncio
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, field
 import itertools
-from typing import Self, override
+from typing import override
 
 from custom_components.evse_bus.evse.bus import Bus
-from custom_components.evse_bus.evse.errors import LineLostError
 from custom_components.evse_bus.evse.framing import LineSettings
-from custom_components.evse_bus.evse.line import Line
 from custom_components.evse_bus.evse.modbus import RtuFramer
 from custom_components.evse_bus.evse.model import Circuit, CurrentLimit, Orders
 from custom_components.evse_bus.evse.smartevse.config import SlaveConfig
 from custom_components.evse_bus.evse.smartevse.master import Master
 from custom_components.evse_bus.evse.smartevse.reader import TIMING
 from custom_components.evse_bus.evse.smartevse.slave import SlaveSmartEvse
+from tests.evse.simulated_line import LiveScene, SimulatedLine
 from tests.simulated_time import now
 from tests.virtual import Car, SmartEvseController
 from tests.virtual.smartevse_registers import DIALECTS
 
 SETTINGS = LineSettings(baudrate=9600)
 BYTE = SETTINGS.byte_time
-STEP = 0.02
 BROADCAST = bytes((0, 0x10, 0, 1))
 
 
@@ -74,77 +70,46 @@ class Sent:
         return tuple(int.from_bytes(bytes(pair), "big") for pair in pairs)
 
 
-class Ether(Line):
+class SmartEvseLine(SimulatedLine[Sent]):
     """The wire: bytes take their time, and what overlaps is lost."""
 
     def __init__(self) -> None:
-        super().__init__("simulated", SETTINGS)
+        super().__init__(SETTINGS)
         self.boxes: dict[int, Box] = {}
-        self.sent: list[Sent] = []
-        self.refuse_open: Exception | None = None
         self.busy_until = 0.0
-        self.on_sent: Callable[[Sent], None] = lambda _sent: None
-        self._open = False
+        self.lumps = 1
         self._lost_until = 0.0
 
-    @property
     @override
-    def is_open(self) -> bool:
-        return self._open
+    def record(self, data: bytes, end: float) -> Sent:
+        return Sent(now(), data)
 
     @override
-    async def open(self) -> None:
-        if self.refuse_open is not None:
-            raise self.refuse_open
-        self._open = True
-        self.last_activity = now()
-
-    @override
-    async def close(self) -> None:
-        self._open = False
-
-    def unplug(self) -> None:
-        self._open = False
-        self.on_lost(LineLostError("unplugged"))
-
-    @override
-    def write(self, data: bytes, *, reply_may_equal: bool = False) -> float:
-        if not self._open:
-            raise LineLostError("not open")
-        begin, end = now(), now() + len(data) * BYTE
-        self.sent.append(Sent(begin, data))
-        self.on_sent(self.sent[-1])
-        self.last_activity = end
-        if begin < self.busy_until:
-            # It meets what somebody else is saying.
+    def carry(self, data: bytes, end: float) -> None:
+        if now() < self.busy_until:
+            # It collides with the frame of another station.
             self._lost_until = self.busy_until = max(self.busy_until, end)
-            return end
+            return
         self.busy_until = end
-        asyncio.get_running_loop().call_at(end, self._arrive, data, None)
-        return end
+        self.loop.call_at(end, self._arrive, data, None)
 
     def say(self, data: bytes, speaker: Box | None = None) -> None:
-        """Let somebody else speak as soon as the line has been quiet for 6 ms."""
+        """Send a frame of another station once the line was quiet for 6 ms."""
         wait = self.busy_until + 0.0061 - now()
         if wait > 0:
-            asyncio.get_running_loop().call_later(wait, self.say, data, speaker)
+            self.loop.call_later(wait, self.say, data, speaker)
             return
-        loop = asyncio.get_running_loop()
-        begin = now()
-        self.busy_until = begin + len(data) * BYTE
-        for index in range(len(data)):
-            at = begin + (index + 1) * BYTE
-            loop.call_at(at, self._hear, data[index : index + 1])
-        loop.call_at(self.busy_until, self._arrive, data, speaker)
+        self.busy_until = self.deliver(data, now())
+        self.loop.call_at(self.busy_until, self._arrive, data, speaker)
 
-    def _hear(self, data: bytes) -> None:
-        if self._open and now() > self._lost_until:
-            self.last_activity = max(self.last_activity, now())
-            self.on_data(data)
+    @override
+    def hear(self, data: bytes) -> None:
+        if now() > self._lost_until:
+            super().hear(data)
 
     def noise(self, data: bytes) -> None:
-        """Bytes out of nowhere, at our end only."""
-        self._hear(data)
+        """Receive bytes out of nowhere, at our end only."""
+        self.hear(data)
 
     def _arrive(self, data: bytes, speaker: Box | None) -> None:
         """Bring a frame to all boxes but its speaker."""
@@ -156,7 +121,7 @@ class Ether(Line):
             answer = box.controller.receive(data, now())
             self._speak_for(box)
             if answer is not None and not box.mute and not box.loses(answer):
-                asyncio.get_running_loop().call_later(box.delay, self.say, answer, box)
+                self.loop.call_later(box.delay, self.say, answer, box)
 
     def _speak_for(self, box: Box) -> None:
         sending = box.controller.sending
@@ -173,7 +138,7 @@ class Ether(Line):
 
 
 @dataclass
-class MasterScene:
+class MasterScene(LiveScene):
     """Our master, its slaves and their cars."""
 
     units: tuple[int, ...] = (2, 3)
@@ -183,7 +148,7 @@ class MasterScene:
     allowed: bool | None = True
     maximum: int = 16
     watch: bool = True
-    line: Ether = field(init=False)
+    line: SmartEvseLine = field(init=False)
     bus: Bus = field(init=False)
     master: Master = field(init=False)
     most: float = field(init=False, default=0.0)
@@ -194,10 +159,9 @@ class MasterScene:
     """By how much the words of one broadcast were above it at worst, 0.1 A."""
 
     def __post_init__(self) -> None:
-        self.line = Ether()
+        self.line = SmartEvseLine()
         self.line.on_sent = self._add_up
         self.new_bus()
-        self._life: asyncio.Task[None] | None = None
         for unit in self.units:
             self.plug_box(unit)
             self.add(unit)
@@ -262,14 +226,6 @@ class MasterScene:
             if sent.data.hex().startswith(start) and sent.when >= since
         ]
 
-    async def until(self, what: Callable[[], object], patience: float = 60.0) -> float:
-        """Wait for something; return how long it took."""
-        begin = now()
-        while not what():
-            assert now() - begin < patience, "it never happened"
-            await asyncio.sleep(STEP)
-        return now() - begin
-
     async def charge(self, *units: int) -> None:
         """Let cars come, and wait until they charge."""
         for unit in units:
@@ -283,26 +239,17 @@ class MasterScene:
             limit = max(self.master.circuit.limit * 10, lowest)
             self.said = max(self.said, sum(sent.words) - limit)
 
-    async def _live(self) -> None:
-        while True:
-            self.line.live()
-            offers = self.offers
-            self.most = max(self.most, offers)
-            over = offers - self.master.circuit.limit
-            self.overshoot = max(self.overshoot, over)
-            await asyncio.sleep(STEP)
+    @override
+    def step(self) -> None:
+        self.line.live()
+        offers = self.offers
+        self.most = max(self.most, offers)
+        over = offers - self.master.circuit.limit
+        self.overshoot = max(self.overshoot, over)
 
-    async def __aenter__(self) -> Self:
-        self._life = asyncio.create_task(self._live())
-        await self.bus.start()
-        return self
-
+    @override
     async def __aexit__(self, *exc: object) -> None:
-        await self.bus.stop()
-        if self._life is not None:
-            self._life.cancel()
-            with suppress(asyncio.CancelledError):
-                await self._life
+        await super().__aexit__(*exc)
         if exc[0] is None:
             assert self.said <= 0, f"{self.said / 10:g} A too many in one broadcast"
         if exc[0] is None and self.watch:

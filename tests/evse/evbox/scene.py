@@ -5,21 +5,19 @@ no code with the library, and take their time from this wire.
 """
 
 import asyncio
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from random import Random
 from typing import Self, override
 
 from custom_components.evse_bus.evse.bus import Bus
-from custom_components.evse_bus.evse.errors import LineLostError
 from custom_components.evse_bus.evse.evbox import PROTOCOL, EvboxCharger, EvboxConfig
 from custom_components.evse_bus.evse.evbox.frames import EvboxFramer
-from custom_components.evse_bus.evse.line import Line
 from custom_components.evse_bus.evse.model import CurrentLimit, Orders
+from tests.evse.simulated_line import SimulatedLine
 from tests.simulated_time import now
-from tests.virtual import CLIENT, EvboxChargePoint, Faults, Order
+from tests.virtual import CLIENT, EvboxChargePoint, Order
 from tests.virtual.evbox_frames import checked, order
 from tests.virtual.wire import Segment
 
@@ -35,63 +33,31 @@ class Sent:
     order: Order
 
 
-class Ether(Line):
-    """A wire with ChargePoints; for these it stands in for their bus."""
+class EvboxLine(SimulatedLine[Sent]):
+    """A wire with ChargePoints."""
 
     def __init__(self, *points: EvboxChargePoint) -> None:
-        super().__init__("ether", PROTOCOL.settings)
+        super().__init__(PROTOCOL.settings)
         self.points: list[EvboxChargePoint] = []
         for point in points:
             self.join(point)
-        self.sent: list[Sent] = []
-        self.faults = Faults()
-        self.rng = Random(1)  # noqa: S311 - repeatable on purpose
-        self.byte_time = self.settings.byte_time
-        self.damage: Callable[[bytes], bytes] = lambda data: data
-        """Changes bytes on their way to the library."""
-        self.watch: Callable[[Order], None] = lambda _order: None
-        """Called with each request at the moment it is sent."""
-        self._open = False
         self._idle_from = -1000.0
 
     def join(self, point: EvboxChargePoint) -> None:
         point.bus = self  # type: ignore[assignment]
         self.points.append(point)
 
-    # -- The library's end
-
-    @property
     @override
-    def is_open(self) -> bool:
-        return self._open
-
-    @override
-    async def open(self) -> None:
-        self._open = True
-        self.last_activity = now()
-
-    @override
-    async def close(self) -> None:
-        self._open = False
-
-    def unplug(self) -> None:
-        self._open = False
-        self.on_lost(LineLostError("unplugged"))
-
-    @override
-    def write(self, data: bytes, *, reply_may_equal: bool = False) -> float:
-        end = now() + len(data) * self.byte_time
+    def record(self, data: bytes, end: float) -> Sent:
         body = checked(data[1:-1].decode())
         assert body is not None, "wrong checksums"
         request = order(body, end)
         assert request is not None, "not a request of the manual"
-        self.watch(request)
-        self.sent.append(Sent(end, request))
-        self._put(data, CLIENT)
-        self.last_activity = end
-        return end
+        return Sent(end, request)
 
-    # -- The wire
+    @override
+    def carry(self, data: bytes, end: float) -> None:
+        self._put(data, CLIENT)
 
     def _put(self, data: bytes, source: str) -> None:
         start = now()
@@ -102,9 +68,8 @@ class Ether(Line):
 
     def _deliver(self, segment: Segment) -> None:
         (source,) = segment.sources
-        if source != CLIENT and self._open:
-            self.last_activity = max(self.last_activity, now())
-            self.on_data(self.damage(segment.data))
+        if source != CLIENT:
+            self.hear(segment.data)
         for point in self.points:
             if point.name != source and not point.faults.dead:
                 point.receive(segment)
@@ -112,16 +77,6 @@ class Ether(Line):
     def foreign(self, data: bytes) -> None:
         """Send bytes of another station now."""
         self._put(data, FOREIGN)
-
-    # -- The part of a bus that a ChargePoint uses
-
-    def time(self) -> float:
-        return now()
-
-    now = time
-
-    def call[T](self, function: Callable[[], T]) -> T:
-        return function()
 
     def send_after_silence(
         self, device: EvboxChargePoint, data: bytes, at: float, silence: float
@@ -133,8 +88,6 @@ class Ether(Line):
         asyncio.get_running_loop().call_at(
             start, self.send_after_silence, device, data, at, silence
         )
-
-    # -- For assertions
 
     @property
     def orders(self) -> list[Order]:
@@ -152,13 +105,13 @@ ORDERS = Orders(limit=CurrentLimit(current=16.0))
 class Scene:
     """A bus in simulated time with one or more ChargePoints."""
 
-    ether: Ether
+    line: EvboxLine
     bus: Bus
 
     @classmethod
     def of(cls, *points: EvboxChargePoint) -> Scene:
-        ether = Ether(*points)
-        return cls(ether, Bus(ether, EvboxFramer(), PROTOCOL.timing, "ether"))
+        line = EvboxLine(*points)
+        return cls(line, Bus(line, EvboxFramer(), PROTOCOL.timing, "simulated"))
 
     def add(
         self, address: int = 1923054, orders: Orders = ORDERS, **values: object
@@ -179,19 +132,11 @@ class Scene:
 
     async def __aexit__(self, *_: object) -> None:
         await self.bus.stop()
-        for point in self.ether.points:
+        for point in self.line.points:
             assert point.counters.silence_violations == 0
             assert point.counters.bad_checksum == 0
             assert point.counters.malformed == 0
             assert point.counters.zero_timeouts == 0
-
-
-async def until(condition: Callable[[], object], limit: float = 300.0) -> None:
-    """Wait in simulated time until a condition is true."""
-    end = now() + limit
-    while not condition():
-        assert now() < end, "it did not happen"
-        await asyncio.sleep(0.01)
 
 
 @contextmanager
