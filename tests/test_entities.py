@@ -215,7 +215,11 @@ async def test_an_unplugged_adapter_and_back(
         bus.replug()
         await wait_for_state(hass, status, "available")
         assert bus.opened == 2
-    warnings = [one for one in caplog.records if "the port" in one.getMessage()]
+    warnings = [
+        one
+        for one in caplog.records
+        if one.levelname == "WARNING" and "the port" in one.getMessage()
+    ]
     assert len(warnings) == 2
 
 

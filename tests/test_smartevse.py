@@ -89,7 +89,7 @@ async def test_access_off_hides_whether_a_car_is_there(hass: HomeAssistant) -> N
         assert not box.contactor
         assert state_of(hass, allowed) == "off"
         assert state_of(hass, plugged) == "unknown"
-        assert state_of(hass, status) == "unavailable"
+        assert state_of(hass, status) == "out_of_service"
 
         await call(hass, "switch.turn_on", allowed)
         assert box.access
@@ -123,7 +123,7 @@ async def test_a_limit_of_nothing_leaves_it_allowed(hass: HomeAssistant) -> None
         limit = await get_entity(hass, "number", entry, "charging_current")
         status = await get_entity(hass, "sensor", entry, "1_status")
         # It says that it may not charge.
-        await wait_for_state(hass, status, "unavailable")
+        await wait_for_state(hass, status, "out_of_service")
         polls = box.requests
         await bus.wait_for_async(lambda: box.requests > polls + 2)
         await wait_for_state(hass, allowed, "on")

@@ -183,3 +183,11 @@ async def test_home_assistant_takes_them(
         for path, text in read(language).items()
         if path.startswith(f"{category}.")
     }
+
+
+@pytest.mark.parametrize("path", sorted(read("en")))
+def test_no_state_is_one_of_home_assistants_own(path: str) -> None:
+    """A sensor that shows ``unavailable`` as a value is greyed as if it were."""
+    assert not path.startswith("entity.") or not path.endswith(
+        (".state.unavailable", ".state.unknown")
+    )

@@ -31,7 +31,8 @@ class Status(StrEnum):
     SUSPENDED_EV = "suspended_ev"
     SUSPENDED_EVSE = "suspended_evse"
     FINISHING = "finishing"
-    UNAVAILABLE = "unavailable"
+    OUT_OF_SERVICE = "out_of_service"
+    """OCPP's *Unavailable*: that word is reserved for states in Home Assistant."""
     FAULTED = "faulted"
 
 
@@ -53,7 +54,8 @@ class Fault(StrEnum):
     LOAD_IMBALANCE = "load_imbalance"
     METER = "meter"
     REDUCED_CURRENT = "reduced_current"
-    UNKNOWN = "unknown"
+    UNRECOGNISED = "unrecognised"
+    """Reported by a code that the manual does not list."""
     # Reported by a SmartEVSE, under its own names (README of v2, register 0xA1).
     LESS_6A = "less_6a"
     """Less than 6 A is left for it: it waits."""

@@ -14,10 +14,10 @@ KNOWN = [
     (0xC2, "C2", Status.CHARGING, True, True, True),
     (0xC3, "C3", Status.CHARGING, True, True, True),
     (0xC4, "C4", Status.CHARGING, True, True, True),
-    (0xE0, "E0", Status.UNAVAILABLE, False, False, False),
-    (0xE1, "E1", Status.UNAVAILABLE, None, None, False),
-    (0xE2, "E2", Status.UNAVAILABLE, None, None, False),
-    (0xE3, "E3", Status.UNAVAILABLE, None, None, False),
+    (0xE0, "E0", Status.OUT_OF_SERVICE, False, False, False),
+    (0xE1, "E1", Status.OUT_OF_SERVICE, None, None, False),
+    (0xE2, "E2", Status.OUT_OF_SERVICE, None, None, False),
+    (0xE3, "E3", Status.OUT_OF_SERVICE, None, None, False),
 ]
 FAULTS = {
     0xF1: ("F1", Fault.CONTACTOR_WELDED),
@@ -75,11 +75,11 @@ def test_an_unknown_state_keeps_its_raw_value(code: int) -> None:
     assert state.name == f"0x{code:02X}"
     assert (state.charging, state.outlet_enabled) == (None, None)
     assert not state.no_current
-    expected = {0xE: Status.UNAVAILABLE, 0xF: Status.FAULTED}.get(code >> 4)
+    expected = {0xE: Status.OUT_OF_SERVICE, 0xF: Status.FAULTED}.get(code >> 4)
     assert state.status is expected
-    assert (state.fault is Fault.UNKNOWN) == (code >> 4 == 0xF)
+    assert (state.fault is Fault.UNRECOGNISED) == (code >> 4 == 0xF)
 
 
 def test_no_f12_and_f13() -> None:
     for code in (0xFC, 0xFD):
-        assert state_of(code).fault is Fault.UNKNOWN
+        assert state_of(code).fault is Fault.UNRECOGNISED

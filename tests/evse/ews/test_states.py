@@ -34,7 +34,7 @@ MANUAL: dict[int, tuple[Status, bool | None, bool | None, Fault | None]] = {
     0x42: (Status.SUSPENDED_EV, True, False, None),
     0x43: (Status.SUSPENDED_EV, True, False, None),
     0x50: (Status.FINISHING, True, False, None),
-    0x60: (Status.FINISHING, True, False, Fault.UNKNOWN),
+    0x60: (Status.FINISHING, True, False, Fault.UNRECOGNISED),
     0xA0: (Status.FAULTED, None, False, Fault.CABLE_CODE),
     0xA1: (Status.FAULTED, None, False, Fault.SOCKET_LOCK),
     0xA2: (Status.FAULTED, None, False, Fault.SOCKET_UNLOCK),
@@ -43,9 +43,9 @@ MANUAL: dict[int, tuple[Status, bool | None, bool | None, Fault | None]] = {
     0xA5: (Status.FAULTED, None, False, Fault.CONFIGURATION),
     0xA7: (Status.FAULTED, None, False, Fault.CARD_READER),
     0xA8: (Status.FAULTED, None, False, Fault.RCD),
-    0xA9: (Status.UNAVAILABLE, None, False, None),
-    0xF0: (Status.UNAVAILABLE, None, False, None),
-    0xFF: (Status.UNAVAILABLE, None, False, None),
+    0xA9: (Status.OUT_OF_SERVICE, None, False, None),
+    0xF0: (Status.OUT_OF_SERVICE, None, False, None),
+    0xFF: (Status.OUT_OF_SERVICE, None, False, None),
 }
 
 
@@ -73,7 +73,7 @@ def test_a_state_that_the_manual_does_not_know_stays_raw() -> None:
         assert (state.plugged, state.charging) == (None, None)
         if 0xA0 <= code <= 0xAF:
             # 3.1.2: "0xAx: error".
-            assert (state.status, state.fault) == (Status.FAULTED, Fault.UNKNOWN)
+            assert (state.status, state.fault) == (Status.FAULTED, Fault.UNRECOGNISED)
         else:
             assert (state.status, state.fault) == (None, None)
 
@@ -117,17 +117,17 @@ def test_the_rcd_is_a_fault_in_every_state() -> None:
 @pytest.mark.parametrize(
     ("result", "fault"),
     [
-        (0, Fault.UNKNOWN),
-        (1, Fault.UNKNOWN),
-        (2, Fault.UNKNOWN),
-        (3, Fault.UNKNOWN),
+        (0, Fault.UNRECOGNISED),
+        (1, Fault.UNRECOGNISED),
+        (2, Fault.UNRECOGNISED),
+        (3, Fault.UNRECOGNISED),
         (4, Fault.CABLE_LOST),
         (5, Fault.RCD),
         (6, Fault.METER),
         (7, Fault.UPSTREAM_TIMEOUT),
         (8, Fault.VENTILATION_REQUESTED),
         (9, Fault.PILOT),
-        (10, Fault.UNKNOWN),
+        (10, Fault.UNRECOGNISED),
     ],
 )
 def test_why_a_charge_was_aborted(result: int, fault: Fault) -> None:

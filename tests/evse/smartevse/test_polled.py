@@ -135,7 +135,7 @@ def test_without_access_an_older_box_hides_the_car(dialect: Dialect) -> None:
         await scene.charger.change_orders(OrderChange(allowed=False))
         assert scene.connector.raw_state == "A"
         assert scene.connector.plugged is None
-        assert scene.connector.status is Status.UNAVAILABLE
+        assert scene.connector.status is Status.OUT_OF_SERVICE
         await scene.charger.change_orders(OrderChange(allowed=True))
         assert scene.connector.plugged is not False
         await scene.until(lambda: scene.box.state == "C")

@@ -80,14 +80,14 @@ STATES: Final[Mapping[int, State]] = {
     C4: _charging("C4", Fault.LOAD_IMBALANCE),
     E0: State(
         "E0",
-        status=Status.UNAVAILABLE,
+        status=Status.OUT_OF_SERVICE,
         charging=False,
         outlet_enabled=False,
         no_current=True,
     ),
-    E1: State("E1", status=Status.UNAVAILABLE),
-    E2: State("E2", status=Status.UNAVAILABLE),
-    E3: State("E3", status=Status.UNAVAILABLE),
+    E1: State("E1", status=Status.OUT_OF_SERVICE),
+    E2: State("E2", status=Status.OUT_OF_SERVICE),
+    E3: State("E3", status=Status.OUT_OF_SERVICE),
     0xF1: _failure("F1", Fault.CONTACTOR_WELDED),
     0xF2: _failure("F2", Fault.INTERNAL),
     0xF3: _failure("F3", Fault.DC_RESIDUAL_CURRENT),
@@ -117,7 +117,7 @@ def state_of(code: int) -> State:
     name = f"0x{code:02X}"
     group = code & 0xF0
     if group == _FAILURES:
-        return State(name, status=Status.FAULTED, fault=Fault.UNKNOWN)
+        return State(name, status=Status.FAULTED, fault=Fault.UNRECOGNISED)
     if group == _OUT_OF_ORDER:
-        return State(name, status=Status.UNAVAILABLE)
+        return State(name, status=Status.OUT_OF_SERVICE)
     return State(name)

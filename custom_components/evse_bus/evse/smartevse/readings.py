@@ -66,7 +66,7 @@ def charger_reading(
     maxima = (status.maximum, settings.get(Setting.MAXIMUM_CURRENT))
     minimum = status.minimum or settings.get(Setting.MINIMUM_CURRENT)
     ocpp = ocpp_status(dialect, status)
-    if ocpp is OcppStatus.UNAVAILABLE and waits:
+    if ocpp is OcppStatus.OUT_OF_SERVICE and waits:
         ocpp = OcppStatus.SUSPENDED_EVSE
     connector = ConnectorReading(
         status=ocpp,

@@ -114,7 +114,7 @@ def ocpp_status(dialect: Dialect, status: Status) -> OcppStatus:
         return OcppStatus.FAULTED
     if status.raw_state == UNPLUGGED:
         if not status.access:
-            return OcppStatus.UNAVAILABLE
+            return OcppStatus.OUT_OF_SERVICE
         if status.faults:
             return OcppStatus.SUSPENDED_EVSE
     return state_of(dialect, status.raw_state).status

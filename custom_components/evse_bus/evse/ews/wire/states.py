@@ -78,9 +78,9 @@ STATES: Final[Mapping[int, State]] = {
     0xA5: _error(0xA5, Fault.CONFIGURATION),
     0xA7: _error(0xA7, Fault.CARD_READER),
     0xA8: _error(0xA8, Fault.RCD),
-    BLOCKED: _state(BLOCKED, Status.UNAVAILABLE, plugged=None),
-    STARTING: State("0xF0", Status.UNAVAILABLE),
-    TEST: State("0xFF", Status.UNAVAILABLE),
+    BLOCKED: _state(BLOCKED, Status.OUT_OF_SERVICE, plugged=None),
+    STARTING: State("0xF0", Status.OUT_OF_SERVICE),
+    TEST: State("0xFF", Status.OUT_OF_SERVICE),
 }
 
 RESULT_FAULTS: Final[Mapping[ChargeResult, Fault]] = {
@@ -108,7 +108,7 @@ def state_of(code: int, *, fixed_cable: bool | None = None) -> State:
     if known is None:
         name = f"0x{code:02X}"
         if code & _GROUP == _ERRORS:
-            return State(name, Status.FAULTED, fault=Fault.UNKNOWN)
+            return State(name, Status.FAULTED, fault=Fault.UNRECOGNISED)
         return State(name)
     if code == SEARCHING and fixed_cable is not None:
         if fixed_cable:
@@ -159,8 +159,8 @@ def port_state(
 def _reason(result: ChargeResult | None) -> Fault:
     # Aborted, but the result is no error, or there is none.
     if result is None:
-        return Fault.UNKNOWN
-    return RESULT_FAULTS.get(result, Fault.UNKNOWN)
+        return Fault.UNRECOGNISED
+    return RESULT_FAULTS.get(result, Fault.UNRECOGNISED)
 
 
 def box_faults(box: BoxStatus) -> frozenset[Fault]:
