@@ -1,4 +1,4 @@
-"""End to end: library, serialx, a pty paced at 38400 baud, a virtual ChargePoint."""
+"""End to end: the library, a line paced at 38400 baud, a virtual ChargePoint."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -14,6 +14,7 @@ from custom_components.evse_bus.evse.evbox import (
     EvboxConfig,
 )
 from custom_components.evse_bus.evse.model import CurrentLimit, OrderChange, Orders
+from tests.evse.wires import MakeBus, each_wire
 from tests.virtual import (
     Car,
     EvboxChargePoint,
@@ -23,8 +24,6 @@ from tests.virtual import (
     orders_in,
 )
 from tests.virtual.evbox_frames import frame
-
-pytestmark = pytest.mark.real_time
 
 ORDERS = Orders(limit=CurrentLimit(current=16.0))
 
@@ -42,9 +41,11 @@ def make(address: int, orders: Orders = ORDERS) -> EvboxCharger:
 
 @asynccontextmanager
 async def on_wire(
-    *points: EvboxChargePoint, echo: bool = False
+    *points: EvboxChargePoint,
+    make_bus: MakeBus = VirtualBus.in_loop,
+    echo: bool = False,
 ) -> AsyncIterator[tuple[VirtualBus, Bus]]:
-    virtual = VirtualBus.pty(*points)
+    virtual = make_bus(*points)
     virtual.faults.echo = echo
     async with virtual:
         bus = PROTOCOL.bus(virtual.url)
@@ -76,10 +77,11 @@ async def orders_sent(virtual: VirtualBus, charger: EvboxCharger) -> None:
 
 
 @pytest.mark.parametrize("echo", [False, True], ids=["quiet", "echoing"])
-async def test_a_car_charges_and_is_paused(*, echo: bool) -> None:
+@each_wire
+async def test_a_car_charges_and_is_paused(make_bus: MakeBus, *, echo: bool) -> None:
     car = Car(max_current=10.0, reaction=0.0, ramp=0.1)
     point = EvboxChargePoint(1923054, [Module(car)], min_interval=0)
-    async with on_wire(point, echo=echo) as (virtual, bus):
+    async with on_wire(point, make_bus=make_bus, echo=echo) as (virtual, bus):
         charger = make(1923054)
         bus.add(charger)
         car.plug_in()

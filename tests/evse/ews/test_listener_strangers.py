@@ -3,7 +3,6 @@
 import asyncio
 from ipaddress import ip_network
 import socket
-import time
 
 import pytest
 
@@ -13,6 +12,7 @@ from custom_components.evse_bus.evse.ews.network import listener as listening
 from custom_components.evse_bus.evse.ews.network.line import AcceptedLine
 from custom_components.evse_bus.evse.ews.wire.info import KEYS
 from custom_components.evse_bus.evse.throttle import LOSSES
+from tests.simulated_time import now
 from tests.virtual.ews_box import EwsBox as VirtualBox
 
 from .dialling import (
@@ -190,13 +190,13 @@ def test_keys_that_nobody_can_press_are_not_told() -> None:
                 first(bus).subscribe_events(told.append)
                 line, wire = bus.line, bus.wire.statistics
                 assert isinstance(line, AcceptedLine)
-                begun = time.monotonic()
+                begun = now()
                 for _ in range(5):
                     replies = wire.replies
                     line.received(record * 500)
                     assert line.is_open
                     await until(lambda n=replies: wire.replies > n)
-                windows = time.monotonic() - begun + 1
+                windows = now() - begun + 1
             assert KEYS <= len(told) <= MOST_KEYS * windows
 
     run(scene)

@@ -1,7 +1,4 @@
-"""The same conversation on a real line, with a clock that runs."""
-
-import asyncio
-import time
+"""The same conversation through a line, at the pace of the wire."""
 
 from custom_components.evse_bus.evse.ews import PROTOCOL
 from custom_components.evse_bus.evse.ews.config import EwsPortConfig
@@ -11,19 +8,17 @@ from custom_components.evse_bus.evse.model import (
     Orders,
     Status,
 )
-from tests.virtual import Car, VirtualBus
+from tests.evse.simulated_line import until
+from tests.evse.wires import MakeBus, each_wire
+from tests.virtual import Car
 from tests.virtual.ews_box import EwsBox as VirtualBox
 
 
-async def until(what: object, patience: float = 8.0) -> None:
-    end = time.monotonic() + patience
-    while not what():  # type: ignore[operator]
-        assert time.monotonic() < end, "it never happened"
-        await asyncio.sleep(0.01)
-
-
-def test_both_ports_on_a_pty() -> None:
-    async def scene(bus: VirtualBus, box: VirtualBox, cars: tuple[Car, Car]) -> None:
+@each_wire
+async def test_both_ports(make_bus: MakeBus) -> None:
+    cars = (Car(), Car())
+    box = VirtualBox(cars=cars)
+    with make_bus(box) as bus:
         async with PROTOCOL.bus(bus.url) as line:
             ports = [
                 PROTOCOL.charger(
@@ -59,8 +54,3 @@ def test_both_ports_on_a_pty() -> None:
             bus.replug()
             await until(lambda: all(port.reading for port in ports))
             assert line.wire.statistics.bad_frames == 0
-
-    cars = (Car(), Car())
-    box = VirtualBox(cars=cars)
-    with VirtualBus.pty(box) as bus:
-        asyncio.run(scene(bus, box, cars))

@@ -9,11 +9,10 @@ from custom_components.evse_bus.evse.model import CurrentLimit, OrderChange, Ord
 from custom_components.evse_bus.evse.smartevse import POLLED
 from custom_components.evse_bus.evse.smartevse.config import PolledConfig
 from custom_components.evse_bus.evse.smartevse.dialects import Dialect
-from tests.virtual import Car, SmartEvse, VirtualBus
+from tests.evse.wires import MakeBus, each_wire
+from tests.virtual import Car, SmartEvse
 
 from .polled import V2_17
-
-pytestmark = pytest.mark.real_time
 
 SCALE = 10.0
 
@@ -25,10 +24,11 @@ async def until(holds: Callable[[], object]) -> None:
 
 
 @pytest.mark.parametrize("dialect", [V2_17])
-async def test_a_charge(dialect: Dialect) -> None:
+@each_wire
+async def test_a_charge(make_bus: MakeBus, dialect: Dialect) -> None:
     car = Car(max_current=32.0)
     box = SmartEvse(dialect.value, car=car, max_current=16)
-    with VirtualBus.pty(box, baud=9600, parity="N", time_scale=SCALE) as virtual:
+    with make_bus(box, baud=9600, parity="N", time_scale=SCALE) as virtual:
         bus = POLLED.bus(virtual.url)
         charger = POLLED.charger(
             PolledConfig(
