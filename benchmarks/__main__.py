@@ -41,7 +41,7 @@ BENCHMARKS: Final = {
 
 
 def main() -> int:
-    """Run the benchmarks that the command line names, or all; 1 if one broke."""
+    """Run the benchmarks of the command line, or all; return 1 if one failed."""
     options = _parser().parse_args()
     about = machine()
     figures: list[Figure] = []
@@ -65,7 +65,7 @@ def main() -> int:
         print(f"\n{name}: {method}")
     print(f"\n{table(figures)}\n\nWritten to {path}")
     if failed:
-        print(f"Could not be taken: {', '.join(failed)}")
+        print(f"Failed: {', '.join(failed)}")
     return bool(failed)
 
 

@@ -1,4 +1,4 @@
-"""(a) How often 16 ABL boxes are read, and what 15 dead ones cost the living one."""
+"""(a) Period of 16 ABL boxes, and of one box beside 15 dead ones."""
 
 import asyncio
 from collections.abc import Sequence
@@ -8,9 +8,9 @@ from statistics import fmean, median
 from custom_components.evse_bus.evse.abl import PROTOCOL
 
 from .figures import Figure, gaps, percentile
+from .oracle import LoggedFrame, Oracle
 from .progress import say
 from .setup import READING_REQUEST, abl_bus, settled, starts_of
-from .witness import Heard, Witness
 
 NAME = "abl-scan"
 _figure = partial(Figure, NAME)
@@ -18,9 +18,9 @@ METHOD = """\
 16 virtual ABL boxes in a process of their own on a pty paced at 38400 8E1, poll
 interval 0, library alone. A period is the time between two reads of 0x002E of the
 same box, taken from the virtual bus's log. Ideal: 16 x (13.75 ms on the wire + 2 ms
-turn-round of the box). Flags (every 30 s a box) are read in between and count. The
-living one among 15 dead is compared with the same box alone on the bus; a reply
-time-out begins when its request (4.9 ms) has left."""
+turn-round of the box). Reads of the flags (every 30 s for each box) in between count.
+The period of one box beside 15 dead ones is compared with that of the same box alone on
+the bus; a reply time-out begins when its request (4.9 ms) has left."""
 
 IDS = range(1, 17)
 DEAD = range(2, 17)
@@ -83,21 +83,21 @@ async def _watch(
     seconds: float,
     dead: Sequence[int] = (),
     kill: Sequence[int] = (),
-) -> list[Heard]:
-    """Poll boxes for a while; return what was on the wire."""
-    async with Witness("abl", ids=list(ids), dead=list(dead)) as witness:
-        bus = abl_bus(witness.url, ids)
+) -> list[LoggedFrame]:
+    """Poll boxes for a while; return the frames on the wire."""
+    async with Oracle("abl", ids=list(ids), dead=list(dead)) as oracle:
+        bus = abl_bus(oracle.url, ids)
         await bus.start()
         try:
             await settled(bus, [f"abl-{one}" for one in dead])
             since = asyncio.get_running_loop().time()
             if kill:
-                await witness.kill([f"abl-{one}" for one in kill])
+                await oracle.kill([f"abl-{one}" for one in kill])
             await asyncio.sleep(seconds)
         finally:
             await bus.stop()
-        return await witness.log(since)
+        return await oracle.log(since)
 
 
-def _periods_of_first(log: Sequence[Heard]) -> list[float]:
+def _periods_of_first(log: Sequence[LoggedFrame]) -> list[float]:
     return gaps(starts_of(log, 1, READING_REQUEST))

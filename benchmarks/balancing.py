@@ -1,4 +1,4 @@
-"""What a wire tells of load balancing: broadcasts, requests, answers, sums. Pure.
+"""Load balancing as seen on the wire: broadcasts, requests, replies, sums. Pure.
 
 All times are seconds of CLOCK_MONOTONIC, all currents amperes.
 """
@@ -17,48 +17,48 @@ from tests.virtual.smartevse_frames import (
 
 from .figures import gaps
 from .offers import Offer
-from .witness import Heard
+from .oracle import LoggedFrame
 
 PERIOD: Final = 2.0
-"""From broadcast to broadcast."""
+"""Between two broadcasts."""
 EARLY: Final = 0.001
-"""A broadcast so little before its time is the one that was due."""
+"""A broadcast this early still counts as the one that is due."""
 REPEATS: Final = 1.0
 """An unanswered request is repeated after this."""
-ANSWERING: Final = 0.012
-"""So soon after a request another box may still say the answer that it owes us."""
+PENDING_REPLY: Final = 0.012
+"""Time after a request within which another box may still send a pending reply."""
 SAME_MOMENT: Final = 0.005
-"""Boxes that hear one frame do not follow it in the same microsecond."""
+"""Spread of the reactions of several boxes to one frame."""
 IN_FLIGHT: Final = 0.05
-"""A frame that was on its way when the supply was lowered still counts for it."""
+"""Time after a lowering of the supply within which a frame may be on its way."""
 ROUNDING: Final = 0.01
 
 
-def _packet(heard: Heard) -> Packet | None:
-    return decode(heard.data, (*READS, WRITE_ONE, WRITE_SEVERAL))
+def _packet(frame: LoggedFrame) -> Packet | None:
+    return decode(frame.data, (*READS, WRITE_ONE, WRITE_SEVERAL))
 
 
 # -- Broadcasts ------------------------------------------------------------------
 
 
-def broadcasts(log: Iterable[Heard]) -> list[float]:
-    """Return when our broadcasts of currents began."""
+def broadcasts(log: Iterable[LoggedFrame]) -> list[float]:
+    """Return the start times of our broadcasts of currents."""
     return [
-        heard.start
-        for heard in log
-        if heard.from_client
-        and (packet := _packet(heard)) is not None
+        frame.start
+        for frame in log
+        if frame.from_client
+        and (packet := _packet(frame)) is not None
         and (packet.unit, packet.function) == (0, WRITE_SEVERAL)
         and packet.register == 1
     ]
 
 
 def on_plan(times: Iterable[float], begin: float) -> list[tuple[float, float]]:
-    """Return the broadcasts that were due, each with its deviation from the plan.
+    """Return the times of the due broadcasts, each with its deviation from the plan.
 
-    The plan is a grid of exactly 2 s from ``begin`` on. What is due is the first one
-    from a point of it on, however late; those between, sent because something had
-    changed, stand for none.
+    The plan is a grid of exactly 2 s from ``begin`` on. The first broadcast after each
+    of its points is the due one, however late. The others, sent because of a change,
+    are left out.
     """
     due: list[tuple[float, float]] = []
     for time in times:
@@ -77,68 +77,70 @@ def longest_silence(times: Sequence[float], end: float) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class SlaveRequest:
     """A request of a box to its master."""
 
     unit: int
     register: int
     end: float
     idle: float
-    """When nobody spoke any more."""
-    answered: float | None
-    """When our answer began; ``None``: not before the box had given up."""
+    """When the bus was idle."""
+    replied: float | None
+    """Start of our reply; ``None``: none before the box repeated its request."""
     garbled: bool
-    """Somebody else spoke at the same time: nobody can have heard it."""
+    """It collided with another frame: no station can have received it."""
 
 
-def requests(log: Sequence[Heard]) -> list[Asked]:
-    """Return all requests of boxes (01 to 04) and what became of them."""
-    asked: list[Asked] = []
-    for index, heard in enumerate(log):
-        packet = None if heard.from_client else _packet(heard)
+def requests(log: Sequence[LoggedFrame]) -> list[SlaveRequest]:
+    """Return all requests of boxes (01 to 04) and the replies to them."""
+    found: list[SlaveRequest] = []
+    for index, frame in enumerate(log):
+        packet = None if frame.from_client else _packet(frame)
         if packet is None or packet.function != WRITE_ONE or packet.register > 4:  # noqa: PLR2004 - the last of them
             continue
         behind = log[index + 1 :]
-        answer = _answer(behind, packet, heard)
-        asked.append(
-            Asked(
+        reply = _reply(behind, packet, frame)
+        found.append(
+            SlaveRequest(
                 packet.unit,
                 packet.register,
-                heard.end,
-                _idle(behind, heard.end),
-                answer,
-                heard.collided,
+                frame.end,
+                _idle(behind, frame.end),
+                reply,
+                frame.collided,
             )
         )
-    return asked
+    return found
 
 
-def _idle(behind: Iterable[Heard], idle: float) -> float:
-    for heard in behind:
-        if heard.start > idle + ANSWERING or heard.from_client:
+def _idle(behind: Iterable[LoggedFrame], idle: float) -> float:
+    for frame in behind:
+        if frame.start > idle + PENDING_REPLY or frame.from_client:
             break
-        idle = max(idle, heard.end)
+        idle = max(idle, frame.end)
     return idle
 
 
-def _answer(behind: Iterable[Heard], asked: Packet, request: Heard) -> float | None:
-    for heard in behind:
-        if heard.start > request.start + REPEATS:
+def _reply(
+    behind: Iterable[LoggedFrame], packet: Packet, request: LoggedFrame
+) -> float | None:
+    for frame in behind:
+        if frame.start > request.start + REPEATS:
             break
-        packet = _packet(heard) if heard.from_client else None
-        if packet is None or (packet.unit, packet.function) != (asked.unit, WRITE_ONE):
+        reply = _packet(frame) if frame.from_client else None
+        if reply is None or (reply.unit, reply.function) != (packet.unit, WRITE_ONE):
             continue
-        if packet.register == 0x80 | asked.register:
-            return heard.start
+        if reply.register == 0x80 | packet.register:
+            return frame.start
     return None
 
 
-# -- What all boxes together offer -----------------------------------------------
+# -- The sum of all offers -------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class Shared:
-    """What the boxes may share from a moment on."""
+    """The supply that the boxes share from a time on."""
 
     at: float
     amps: float
@@ -146,18 +148,18 @@ class Shared:
 
 @dataclass(frozen=True, slots=True)
 class Sums:
-    """The sum of what boxes with a closed contactor offer, beside what they share."""
+    """The sum of the offers of boxes with a closed contactor, against the supply."""
 
     most: float
     """The highest sum."""
     violations: int
-    """How often it has risen above what they share."""
+    """Number of rises above the supply."""
     longest: float
-    """Longest time that it stood above a supply which had been lowered."""
+    """Longest time above a supply that was lowered."""
 
 
 def sums(offers: Iterable[Offer], shared: Iterable[Shared], end: float) -> Sums:
-    """Look at each change of an offer and of the supply, in their order."""
+    """Evaluate the changes of offers and of the supply, in their order."""
     changes: list[Offer | Shared] = [*offers, *shared]
     changes.sort(key=lambda change: change.at)
     now: dict[str, float] = {}

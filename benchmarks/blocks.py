@@ -1,7 +1,7 @@
-"""How long single callbacks hold an event loop.
+"""Time that single callbacks hold an event loop.
 
-asyncio runs everything through `Handle._run`; for a while, that is timed. It costs
-some microseconds a callback, so nothing else is measured meanwhile.
+asyncio runs every callback through `Handle._run`, which is timed for a while. It costs
+some microseconds for each callback, so nothing else is measured meanwhile.
 """
 
 from asyncio import Handle
@@ -15,23 +15,23 @@ import time
 from typing import Any, Final
 
 KEPT: Final = 5
-_MENTIONED: Final = 1e-3
-"""Shortest garbage collection that is told of, s."""
+_LISTED: Final = 1e-3
+"""Shortest garbage collection that is listed, s."""
 
 
 @dataclass(slots=True)
 class Blocks:
-    """The callbacks of a while."""
+    """The callbacks within a time."""
 
     seconds: list[float] = field(default_factory=list)
-    """Wall time of each, s: also what other threads and processes took from it."""
+    """Wall time of each, s, including time that other threads and processes took."""
     longest: list[tuple[float, float, str]] = field(default_factory=list)
-    """Of the longest ones: wall time and this thread's own processor time, s; what."""
+    """Of the longest ones: wall time and processor time of this thread, s; name."""
     busiest: tuple[float, str] = (0.0, "")
-    """Most processor time of one, s, without the interpreter's garbage collection."""
+    """Most processor time of one, s, without garbage collection; its name."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what can be sent to another process."""
+        """Return it for another process."""
         return {
             "seconds": [one for one in self.seconds if one > 1e-3],  # noqa: PLR2004
             "callbacks": len(self.seconds),
@@ -41,7 +41,7 @@ class Blocks:
 
 
 class _Collections:
-    """How much processor time garbage collection has taken from this thread, s."""
+    """Processor time of garbage collections in this thread, s."""
 
     def __init__(self) -> None:
         self.taken = 0.0
@@ -62,10 +62,10 @@ def watch() -> Iterator[Blocks]:
     """Time all callbacks of all loops of this process."""
     blocks = Blocks()
     collections = _Collections()
-    run = Handle._run  # noqa: SLF001 - the one place that everything passes
+    run = Handle._run  # noqa: SLF001 - every callback passes it
 
     def timed(handle: Handle) -> None:
-        what: object = getattr(handle, "_callback", None)
+        callback: object = getattr(handle, "_callback", None)
         collected = collections.taken
         wall, own = time.perf_counter(), time.thread_time()
         run(handle)
@@ -73,10 +73,10 @@ def watch() -> Iterator[Blocks]:
         collected = collections.taken - collected
         blocks.seconds.append(took)
         if used - collected > blocks.busiest[0]:
-            blocks.busiest = (used - collected, _name(what))
+            blocks.busiest = (used - collected, _name(callback))
         if len(blocks.longest) < KEPT or took > blocks.longest[0][0]:
-            name = _name(what)
-            if collected > _MENTIONED:
+            name = _name(callback)
+            if collected > _LISTED:
                 name += f", {collected * 1000:.0f} ms of it garbage collection"
             entry = (took, used, name)
             if len(blocks.longest) < KEPT:
@@ -94,7 +94,7 @@ def watch() -> Iterator[Blocks]:
 
 
 def _name(callback: object) -> str:
-    """Return whose callback it was: a task's name, or a function's."""
+    """Return the name of a callback: that of its task, or of its function."""
     owner = getattr(callback, "__self__", None)
     if owner is not None and hasattr(owner, "get_coro"):
         coro = owner.get_coro()

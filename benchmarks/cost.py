@@ -1,4 +1,4 @@
-"""What something costs Home Assistant: processor, memory, blocks of its event loop."""
+"""The cost of chargers in Home Assistant: processor, memory, blocks of its loop."""
 
 from collections.abc import Mapping
 from typing import Any, Final
@@ -11,7 +11,7 @@ LONGEST_BLOCK: Final = 10.0
 
 
 async def measure(house: House, seconds: float) -> dict[str, Any]:
-    """Return what it costs right now; takes twice as long."""
+    """Return the cost now; takes twice this time (s)."""
     return {
         **await house.do("cost", seconds=seconds),
         **await house.do("blocks", seconds=seconds),
@@ -22,7 +22,7 @@ async def measure(house: House, seconds: float) -> dict[str, Any]:
 def cost_figures(
     benchmark: str, idle: Mapping[str, Any], polled: Mapping[str, Any], what: str
 ) -> list[Figure]:
-    """Return the cost of chargers, beside Home Assistant's own."""
+    """Return the cost of chargers, and that of Home Assistant without them."""
     new = polled["states"] - idle["states"]
     rate = polled["changes_per_second"] - idle["changes_per_second"]
 
@@ -60,7 +60,7 @@ def cost_figures(
 def block_figure(
     benchmark: str, name: str, blocks: Mapping[str, Any], aim: float | None = None
 ) -> Figure:
-    """Return the longest block, and whose it was."""
+    """Return the longest block, and its callback."""
     took, own, what = blocks["longest"][0]
     note = f"own time {own * 1000:.1f} ms: {what}"
     return Figure(benchmark, name, took * 1000, "ms", aim=aim, note=note)
@@ -69,13 +69,13 @@ def block_figure(
 def busy_figure(
     benchmark: str, name: str, blocks: Mapping[str, Any], aim: float | None = None
 ) -> Figure:
-    """Return the most processor time that one callback has used, and which."""
+    """Return the most processor time of one callback, and its name."""
     used, what = blocks["busiest"]
     name = f"most own time of one callback, {name}"
     return Figure(benchmark, name, used * 1000, "ms", aim=aim, note=what)
 
 
 def _p999(blocks: Mapping[str, Any]) -> float:
-    # Only those above a millisecond are told one by one.
+    # Only those above a millisecond are listed one by one.
     short = blocks["callbacks"] - len(blocks["seconds"])
     return percentile([0.0] * short + blocks["seconds"], 0.999) * 1000

@@ -4,35 +4,35 @@ import asyncio
 from statistics import fmean
 
 from .figures import Figure, gaps, percentile
+from .oracle import LoggedFrame, Oracle
 from .progress import say
 from .setup import evbox_bus
-from .witness import Heard, Witness
 
 NAME = "evbox-bus"
 METHOD = """\
 8 virtual ChargePoints of 20 modules, a car charging at each, in a process of their own
 on a pty paced at 38400 8N1; command 68, period 5 s, time-out 60 s, library alone.
-Intervals are from the virtual bus's log. The wire's share is bytes on the wire; the
-bus's own utilisation also has the silence before the reply (100 ms) and what of ours
-(100 ms asked for by the manual, 120 ms kept) was not over when its turn came. Ideal round: 8 x (278.6 + 2 x 100)
-ms = 3.83 s of 5 s."""
+Intervals are from the virtual bus's log. The share of the wire is bytes on the wire; the
+utilisation of the bus also includes the silence before the reply (100 ms) and the rest
+of the silence before our request (100 ms by the manual, 120 ms kept). Ideal round: 8 x
+(278.6 + 2 x 100) ms = 3.83 s of 5 s."""
 
 SERIALS = range(1923051, 1923059)
 MODULES = 20
 PERIOD = 5.0
 TIMEOUT = 60
 WARM_UP = 25.0
-"""Two replies must agree, and until then a box is left alone for 20 s."""
+"""Two replies must agree, and until then the minimum interval is 20 s."""
 
 
 async def run(*, quick: bool) -> list[Figure]:
     """Return the figures."""
     seconds = 30.0 if quick else 120.0
-    async with Witness("evbox", serials=list(SERIALS), modules=MODULES) as witness:
-        bus = evbox_bus(witness.url, SERIALS, period=PERIOD, timeout=TIMEOUT)
+    async with Oracle("evbox", serials=list(SERIALS), modules=MODULES) as oracle:
+        bus = evbox_bus(oracle.url, SERIALS, period=PERIOD, timeout=TIMEOUT)
         await bus.start()
         try:
-            say("8 ChargePoints get to know us")
+            say("8 ChargePoints are polled for the first time")
             await asyncio.sleep(WARM_UP)
             loop = asyncio.get_running_loop()
             since, busy = loop.time(), bus.wire.statistics.busy_time
@@ -42,14 +42,16 @@ async def run(*, quick: bool) -> list[Figure]:
             busy = bus.wire.statistics.busy_time - busy
         finally:
             await bus.stop()
-        log = await witness.log(since)
-        devices = (await witness.stats())["devices"].values()
+        log = await oracle.log(since)
+        devices = (await oracle.stats())["devices"].values()
     statistics = bus.wire.statistics
-    told = [heard for heard in log if heard.end <= since + elapsed]
+    frames = [frame for frame in log if frame.end <= since + elapsed]
     intervals = [
-        interval for serial in SERIALS for interval in gaps(_requests_to(serial, told))
+        interval
+        for serial in SERIALS
+        for interval in gaps(_requests_to(serial, frames))
     ]
-    on_wire = sum(heard.end - heard.start for heard in told)
+    on_wire = sum(frame.end - frame.start for frame in frames)
     return [
         Figure(
             benchmark=NAME,
@@ -62,7 +64,7 @@ async def run(*, quick: bool) -> list[Figure]:
         ),
         Figure(
             benchmark=NAME,
-            name="boxes fallen back, silence broken, spoken to too soon",
+            name="fail-backs, silence violations, requests too soon",
             value=sum(
                 device[name]
                 for device in devices
@@ -80,11 +82,11 @@ async def run(*, quick: bool) -> list[Figure]:
     ]
 
 
-def _requests_to(serial: int, log: list[Heard]) -> list[float]:
+def _requests_to(serial: int, log: list[LoggedFrame]) -> list[float]:
     # STX, destination, source, command; then the serial number's eight digits.
     digits = f"{serial:08d}".encode()
     return [
-        heard.start for heard in log if heard.from_client and heard.data[7:15] == digits
+        frame.start for frame in log if frame.from_client and frame.data[7:15] == digits
     ]
 
 

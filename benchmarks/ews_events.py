@@ -1,4 +1,4 @@
-"""(i) From a key at an EWS-Box to the event in Home Assistant, and from a wish to it."""
+"""(i) Time from a key or a start request at an EWS-Box to Home Assistant."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, Sequence
@@ -10,8 +10,8 @@ from typing import Any, Final
 from .figures import Figure, percentile
 from .house import LOADED, House, free_port
 from .house_boxes import box_entry
+from .oracle import LoggedFrame, Oracle
 from .progress import say
-from .witness import Heard, Witness
 
 NAME = "ews-events"
 _figure = partial(Figure, NAME)
@@ -20,44 +20,44 @@ A real Home Assistant ({LOADED}) with one EWS-Box of two ports, in manual I/O mo
 waiting at each, in a process of its own: on a pty paced at 115200 8N1, then dialling
 Home Assistant's listener. Once polled every 2 s and nothing else; once 'busy': poll
 interval 0, and number.set_value for port 1 and 2 in turn, the next one 20 to 100 ms
-after the one before was confirmed. At random moments key 1 of a port goes down and,
-150 ms or more later, up: until the state_changed event of that port's event entity
-(one monotonic clock for both processes). 'On our side': from the end of the info
+after the one before was confirmed. At random moments key 1 of a port is pressed and,
+150 ms or more later, released: time until the state_changed event of that port's event
+entity (one monotonic clock for both processes). 'On our side': from the end of the info
 record on the wire, which takes 1.4 ms of RS-232 and waits for the end of an answer.
-Start requests are made, and taken back 0.3 to 0.6 s later, by the box's web page: until
-the state_changed event of the binary sensor, for which the box has to be asked (rc and
-rd, 21 ms of RS-232) first."""
+Start requests are made, and withdrawn 0.3 to 0.6 s later, on the box's web page: time
+until the state_changed event of the binary sensor, for which the box must be read first
+(rc and rd, 21 ms of RS-232)."""
 
 SERIAL: Final = "000000000701"
 BOX: Final = f"ews-{SERIAL}"
 SLOW: Final = 2.0
 REST: Final = 1.5
-"""So long what was done last may take, s."""
+"""Longest time until the last action shows, s."""
 RECORD: Final = b"\x02\x00\x0bIif"
-"""What an info record begins with."""
+"""The first bytes of an info record."""
 LONGEST: Final = 1800.0
-"""All of it, s."""
+"""Limit for the whole benchmark, s."""
 
 
 @dataclass(frozen=True, slots=True)
-class Happened:
-    """Something that was done or seen, s of CLOCK_MONOTONIC."""
+class Occurrence:
+    """An action at a box or a change in Home Assistant, at s of CLOCK_MONOTONIC."""
 
     at: float
     port: int
-    what: str
-    """As Home Assistant is to show it."""
+    state: str
+    """As Home Assistant shows it."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Kind:
-    """What is done at a box, and where Home Assistant shows it."""
+    """A kind of actions at a box, and the entity that shows them."""
 
     name: str
     platform: str
     key: str
-    deeds: tuple[tuple[str, str], tuple[str, str]]
-    """What is done in turn, and what is to be seen then."""
+    actions: tuple[tuple[str, str], tuple[str, str]]
+    """The actions in turn, and the state that shows each."""
     pauses: tuple[float, float]
     """Shortest and longest time between two of them, s."""
     values: tuple[int, ...] = ()
@@ -75,9 +75,8 @@ START: Final = _Kind(
     "start request",
     "binary_sensor",
     "start_requested",
-    (("ask_for_start", "on"), ("take_back", "off")),
-    # Sooner, the second one would wait: a box is not asked more often than this
-    # because of what it tells (INFO_PAUSE).
+    (("request_start", "on"), ("withdraw", "off")),
+    # Not sooner: after an info record a box is read again only after INFO_PAUSE.
     (0.3, 0.6),
 )
 
@@ -89,11 +88,11 @@ async def run(*, quick: bool) -> list[Figure]:
     async with asyncio.timeout(LONGEST):
         say("starting Home Assistant")
         async with House() as house:
-            # What it does after its start is not ours.
+            # Its work after the start is not measured.
             await house.do("cost", seconds=5.0 if quick else 45.0)
-            for what, way in (("RS-232", _serial), ("TCP", _network)):
+            for line, way in (("RS-232", _serial), ("TCP", _network)):
                 for busy in (False, True):
-                    name = f"{what}, busy" if busy else what
+                    name = f"{line}, busy" if busy else line
                     figures += await way(
                         house,
                         0.0 if busy else SLOW,
@@ -102,25 +101,25 @@ async def run(*, quick: bool) -> list[Figure]:
     return figures
 
 
-type _Then = Callable[[Witness], Awaitable[list[Figure]]]
+type _Measure = Callable[[Oracle], Awaitable[list[Figure]]]
 
 
-async def _serial(house: House, interval: float, then: _Then) -> list[Figure]:
-    async with Witness("ews", boxes=_boxes()) as witness:
+async def _serial(house: House, interval: float, measure: _Measure) -> list[Figure]:
+    async with Oracle("ews", boxes=_boxes()) as oracle:
         await house.do(
-            "add_boxes", **box_entry([SERIAL], interval=interval, device=witness.url)
+            "add_boxes", **box_entry([SERIAL], interval=interval, device=oracle.url)
         )
-        figures = await then(witness)
+        figures = await measure(oracle)
         await house.do("remove")
     return figures
 
 
-async def _network(house: House, interval: float, then: _Then) -> list[Figure]:
+async def _network(house: House, interval: float, measure: _Measure) -> list[Figure]:
     port = free_port()
-    async with Witness("ews", boxes=_boxes(), dial=f"127.0.0.1:{port}") as witness:
-        where: dict[str, Any] = {"host": "127.0.0.1", "port": port}
-        await house.do("add_boxes", **box_entry([SERIAL], interval=interval, **where))
-        figures = await then(witness)
+    async with Oracle("ews", boxes=_boxes(), dial=f"127.0.0.1:{port}") as oracle:
+        address: dict[str, Any] = {"host": "127.0.0.1", "port": port}
+        await house.do("add_boxes", **box_entry([SERIAL], interval=interval, **address))
+        figures = await measure(oracle)
         await house.do("remove")
     return figures
 
@@ -130,9 +129,9 @@ def _boxes() -> list[dict[str, Any]]:
 
 
 async def _measure(
-    house: House, name: str, witness: Witness, *, busy: bool, seconds: float
+    house: House, name: str, oracle: Oracle, *, busy: bool, seconds: float
 ) -> list[Figure]:
-    # It has just been met: limit and clock are set, the entities are added.
+    # It was just added: limit and clock are set, the entities are added.
     await house.do("cost", seconds=5.0)
     figures: list[Figure] = []
     for kind in (KEY, START):
@@ -145,36 +144,36 @@ async def _measure(
                 key=kind.key,
                 busy=busy,
             ),
-            _do_at_random(witness, kind, seconds),
+            _do_at_random(oracle, kind, seconds),
         )
-        seen = [Happened(at, port, what) for at, port, what in watched["seen"]]
+        seen = [Occurrence(at, port, state) for at, port, state in watched["seen"]]
         figures += _figures(f"{name}, {kind.name}", done, seen, watched)
-        told = told_by(await witness.log(done[0].at), done)
-        figures += _told_figures(f"{name}, {kind.name}", told, seen)
+        reported = reported_by(await oracle.log(done[0].at), done)
+        figures += _own_figures(f"{name}, {kind.name}", reported, seen)
     return figures
 
 
 async def _do_at_random(
-    witness: Witness, kind: _Kind, seconds: float
-) -> list[Happened]:
-    """Do it, and undo it, at a port and then at the other, for so long."""
+    oracle: Oracle, kind: _Kind, seconds: float
+) -> list[Occurrence]:
+    """Do these actions at both ports in turn, for this time (s)."""
     dice = Random(1)  # noqa: S311 - repeatable on purpose
     loop = asyncio.get_running_loop()
     until = loop.time() + seconds
-    done: list[Happened] = []
+    done: list[Occurrence] = []
     while loop.time() < until:
         port = 1 + len(done) // 2 % 2
-        for deed, what in kind.deeds:
+        for action, state in kind.actions:
             await asyncio.sleep(dice.uniform(*kind.pauses))
-            at = await witness.touch(BOX, deed, port, *kind.values)
-            done.append(Happened(at, port, what))
+            at = await oracle.operate(BOX, action, port, *kind.values)
+            done.append(Occurrence(at, port, state))
     return done
 
 
-def delays(done: Sequence[Happened], seen: Sequence[Happened]) -> list[float]:
-    """Return how long it took until each of them was seen; those never seen are missing.
+def delays(done: Sequence[Occurrence], seen: Sequence[Occurrence]) -> list[float]:
+    """Return the time from each action to its change, s; without a change: left out.
 
-    What is seen belongs to the last of its kind that was done before.
+    A change belongs to the last action of its kind before it.
     """
     took: list[float] = []
     for at, one in enumerate(done):
@@ -189,27 +188,29 @@ def delays(done: Sequence[Happened], seen: Sequence[Happened]) -> list[float]:
     return took
 
 
-def _alike(one: Happened, two: Happened) -> bool:
-    return (one.port, one.what) == (two.port, two.what)
+def _alike(one: Occurrence, two: Occurrence) -> bool:
+    return (one.port, one.state) == (two.port, two.state)
 
 
-def told_by(log: Sequence[Heard], done: Sequence[Happened]) -> list[Happened]:
-    """Return when the box had told what was done: at the end of its info record."""
+def reported_by(
+    log: Sequence[LoggedFrame], done: Sequence[Occurrence]
+) -> list[Occurrence]:
+    """Return the ends of the info records that report these actions."""
     records = [
-        heard for heard in log if not heard.from_client and RECORD in heard.data[:6]
+        frame for frame in log if not frame.from_client and RECORD in frame.data[:6]
     ]
-    told: list[Happened] = []
+    reported: list[Occurrence] = []
     for one in done:
-        record = next((heard for heard in records if heard.start >= one.at), None)
+        record = next((frame for frame in records if frame.start >= one.at), None)
         if record is not None:
-            told.append(Happened(record.end, one.port, one.what))
-    return told
+            reported.append(Occurrence(record.end, one.port, one.state))
+    return reported
 
 
 def _figures(
     name: str,
-    done: Sequence[Happened],
-    seen: Sequence[Happened],
+    done: Sequence[Occurrence],
+    seen: Sequence[Occurrence],
     watched: dict[str, Any],
 ) -> list[Figure]:
     took = delays(done, seen)
@@ -226,10 +227,10 @@ def _figures(
     ]
 
 
-def _told_figures(
-    name: str, told: Sequence[Happened], seen: Sequence[Happened]
+def _own_figures(
+    name: str, reported: Sequence[Occurrence], seen: Sequence[Occurrence]
 ) -> list[Figure]:
-    took = delays(told, seen)
+    took = delays(reported, seen)
     return [
         _milliseconds(f"{name}: on our side, p50", percentile(took, 0.5)),
         _milliseconds(f"{name}: on our side, p99", percentile(took, 0.99)),

@@ -1,4 +1,4 @@
-"""(j) 50 EWS-Boxes that dial one listener: what they cost, and who waits for whom."""
+"""(j) 50 EWS-Boxes that dial one listener: their cost, and their poll periods."""
 
 import asyncio
 from collections.abc import Mapping, Sequence
@@ -12,8 +12,8 @@ from .ews_boxes import REDIALS_AFTER
 from .figures import Figure, gaps, percentile
 from .house import LOADED, House, free_port
 from .house_boxes import box_entry
+from .oracle import Oracle
 from .progress import say
-from .witness import Witness
 
 NAME = "ews-listener"
 _figure = partial(Figure, NAME)
@@ -22,23 +22,24 @@ BOXES: Final = 50
 INTERVAL: Final = 2.0
 FIRST_SERIAL: Final = 20_140_600_001
 SHORT: Final = 3.0
-"""A network that is away for so long is back before anybody has noticed, s."""
+"""Loss of the network that no end notices, s."""
 LONG: Final = 40.0
-"""All connections have been given up long before, s."""
+"""Loss of the network after which all connections were given up, s."""
 LONGEST: Final = 1800.0
-"""All of it, s."""
+"""Limit for the whole benchmark, s."""
 
 METHOD = f"""\
 A real Home Assistant ({LOADED}); {BOXES} virtual EWS-Boxes of two ports, in one other
-process, dial its listener on 127.0.0.1, again {REDIALS_AFTER:g} s after each that comes
-to nothing. All are polled every 2 s, once with free ports, then with a car charging at
-each of the 100 ports. CPU, memory and blocks as in home-assistant. A period is the time
-between two rc that a box has heard, by its own diary, while all are just polled. 'Until
-all are there': until no port's status is unavailable; from the moment when the set-up is
-begun (boxes dial already), and from when all network cables, which leave half-open
-connections when they are pulled, are put back: {LONG:g} s after, and {SHORT:g} s after,
-when nobody has noticed yet; then it is until the last box has been asked rc again. A
-number that is connected keeps its connection until that has not answered for 10 s."""
+process, dial its listener on 127.0.0.1, again {REDIALS_AFTER:g} s after each failed
+attempt. All are polled every 2 s, once with free ports, then with a car charging at each
+of the 100 ports. CPU, memory and blocks as in home-assistant. A period is the time
+between two rc in the record of a box, while all are polled and nothing else. 'Until all
+are available': until no port's status is unavailable; from the beginning of the set-up
+(the boxes dial already), and from the time at which all network cables, which leave
+half-open connections when pulled, are plugged in again: after {LONG:g} s, and after
+{SHORT:g} s, when no end has noticed the loss; then it is until the last box has received
+rc again. A serial number that is connected keeps its connection until the box has not
+answered on it for 10 s."""
 
 
 async def run(*, quick: bool) -> list[Figure]:
@@ -50,11 +51,11 @@ async def run(*, quick: bool) -> list[Figure]:
     async with asyncio.timeout(LONGEST):
         say("starting Home Assistant")
         async with House() as house:
-            # What it does after its start is not ours.
+            # Its work after the start is not measured.
             await house.do("cost", seconds=15.0 if quick else 45.0)
             say(f"idle, 2 x {seconds:.0f} s")
             idle = await measure(house, seconds)
-            async with Witness("ews", boxes=boxes, dial=f"127.0.0.1:{port}") as witness:
+            async with Oracle("ews", boxes=boxes, dial=f"127.0.0.1:{port}") as oracle:
                 say(f"adding {BOXES} boxes that dial already")
                 entry = box_entry(
                     serials, interval=INTERVAL, host="127.0.0.1", port=port
@@ -65,7 +66,7 @@ async def run(*, quick: bool) -> list[Figure]:
                 # Clocks and limits are set; Home Assistant writes the new entities.
                 await house.do("cost", seconds=20.0)
                 return [
-                    *await _polled(house, witness, idle, seconds),
+                    *await _polled(house, oracle, idle, seconds),
                     _figure(
                         "memory, more at once when they are added",
                         (new["memory"] - idle["memory"]) / 1e6,
@@ -75,25 +76,25 @@ async def run(*, quick: bool) -> list[Figure]:
                     *_there("added", adding["took"], begun),
                     block_figure(NAME, "longest block while they are added", adding),
                     busy_figure(NAME, "while they are added", adding),
-                    *await _away(house, witness, SHORT),
-                    *await _away(house, witness, LONG),
+                    *await _away(house, oracle, SHORT),
+                    *await _away(house, oracle, LONG),
                     *await _reloaded(house),
                 ]
 
 
 async def _polled(
-    house: House, witness: Witness, idle: Mapping[str, Any], seconds: float
+    house: House, oracle: Oracle, idle: Mapping[str, Any], seconds: float
 ) -> list[Figure]:
-    """Measure them free, and charging."""
+    """Measure with free ports, and with all ports charging."""
     counted = await house.do("statistics")
-    before = (await witness.stats())["dropped"]
+    before = (await oracle.stats())["dropped"]
     since = time.monotonic()
     say(f"{BOXES} boxes with free ports, 2 x {seconds:.0f} s")
     free = await measure(house, seconds)
     polls = [_Window(since, time.monotonic())]
     say("all charge")
-    await witness.plug_in()
-    # A car is found within a second; its port is read every two.
+    await oracle.plug_in()
+    # A car is detected within a second; its port is read every two.
     await house.do("cost", seconds=5.0)
     took = await house.do("charge")
     await house.do("cost", seconds=10.0)
@@ -101,8 +102,8 @@ async def _polled(
     begun = time.monotonic()
     charging = await measure(house, seconds)
     polls.append(_Window(begun, time.monotonic()))
-    asked = await witness.asked(since)
-    stats = await witness.stats()
+    commands = await oracle.commands(since)
+    stats = await oracle.stats()
     after = await house.do("statistics")
     return [
         _figure(
@@ -119,7 +120,7 @@ async def _polled(
             digits=2,
             note=f"{_charging(stats)} ports charge",
         ),
-        *period_figures(asked, polls),
+        *period_figures(commands, polls),
         _figure(
             "missed deadlines",
             after["missed_deadlines"],
@@ -146,12 +147,12 @@ def _charging(stats: Mapping[str, Any]) -> int:
     )
 
 
-async def _away(house: House, witness: Witness, seconds: float) -> list[Figure]:
-    """Pull all network cables, and put them back."""
+async def _away(house: House, oracle: Oracle, seconds: float) -> list[Figure]:
+    """Pull all network cables, and plug them in again."""
     say(f"all network cables pulled for {seconds:.0f} s")
     before = await house.do("statistics")
     pulled = time.monotonic()
-    await witness.unplug()
+    await oracle.unplug()
     figures: list[Figure] = []
     name = f"away for {seconds:.0f} s"
     if seconds > SHORT:
@@ -161,21 +162,21 @@ async def _away(house: House, witness: Witness, seconds: float) -> list[Figure]:
         )
     await asyncio.sleep(pulled + seconds - time.monotonic())
     back = time.monotonic()
-    await witness.replug()
-    polled = await _until_polled(witness, back)
+    await oracle.replug()
+    polled = await _until_polled(oracle, back)
     took = max(polled, await house.do("until", available=True, since=back))
     after = await house.do("statistics")
     counted = {name: after[name] - before[name] for name in after}
-    # The next thing begins at rest.
+    # The next measurement begins at rest.
     await house.do("cost", seconds=15.0)
     return [*figures, *_there(name, took, counted)]
 
 
-async def _until_polled(witness: Witness, since: float) -> float:
-    """Wait until each box has been asked how its ports are; return how long, s."""
+async def _until_polled(oracle: Oracle, since: float) -> float:
+    """Wait until each box has been polled; return the time it took, s."""
     while True:
-        asked = (await witness.asked(since)).values()
-        first = [next(iter(_polls(one)), None) for one in asked]
+        commands = (await oracle.commands(since)).values()
+        first = [next(iter(_polls(one)), None) for one in commands]
         times = [at for at in first if at is not None]
         if len(times) == BOXES:
             return max(times) - since
@@ -183,13 +184,13 @@ async def _until_polled(witness: Witness, since: float) -> float:
 
 
 async def _reloaded(house: House) -> list[Figure]:
-    say("the listener is set up anew")
+    say("the listener is reloaded")
     reloaded = await house.do("reload")
     counted = await house.do("statistics")
     return [
         *_there("reloaded", reloaded["took"], counted),
-        block_figure(NAME, "longest block while they are set up anew", reloaded),
-        busy_figure(NAME, "while they are set up anew", reloaded),
+        block_figure(NAME, "longest block while they are reloaded", reloaded),
+        busy_figure(NAME, "while they are reloaded", reloaded),
     ]
 
 
@@ -199,32 +200,32 @@ def _there(name: str, seconds: float, counted: Mapping[str, int]) -> list[Figure
         f" {counted['replaced']} replaced"
     )
     return [
-        _figure(f"{name}: until all are there", seconds, "s", digits=2, note=note),
+        _figure(f"{name}: until all are available", seconds, "s", digits=2, note=note),
     ]
 
 
-def _polls(asked: Sequence[tuple[float, str]]) -> list[float]:
-    return [at for at, what in asked if what == "rc"]
+def _polls(commands: Sequence[tuple[float, str]]) -> list[float]:
+    return [at for at, name in commands if name == "rc"]
 
 
 class _Window(NamedTuple):
-    """A while, s of CLOCK_MONOTONIC."""
+    """A span of time, s of CLOCK_MONOTONIC."""
 
     begin: float
     end: float
 
 
 def period_figures(
-    asked: Mapping[str, Sequence[tuple[float, str]]], windows: Sequence[_Window]
+    commands: Mapping[str, Sequence[tuple[float, str]]], windows: Sequence[_Window]
 ) -> list[Figure]:
-    """Return the figures of when each box was asked how its ports are."""
+    """Return the figures of the poll periods of all boxes."""
     each = [
         [
             period
             for begin, end in windows
             for period in gaps(at for at in _polls(one) if begin <= at < end)
         ]
-        for one in asked.values()
+        for one in commands.values()
     ]
     every = [period for one in each for period in one]
     worst = max(each, key=lambda one: percentile(one, 0.99))

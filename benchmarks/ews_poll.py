@@ -1,4 +1,4 @@
-"""(h) How often an EWS-Box is asked, on a line that could carry more."""
+"""(h) Poll period of an EWS-Box, on a line that could carry more."""
 
 import asyncio
 from collections.abc import Iterable, Sequence
@@ -7,15 +7,15 @@ from statistics import fmean, median
 from typing import Final
 
 from .figures import Figure, gaps, percentile
+from .oracle import LoggedFrame, Oracle
 from .progress import say
 from .setup import ews_bus, settled
-from .witness import Heard, Witness
 
 NAME = "ews-poll"
 _figure = partial(Figure, NAME)
 
 PORTS_REQUEST: Final = b"Crc"
-"""What `rc` has behind its length."""
+"""The bytes of `rc` after its length."""
 _BYTE: Final = 10 / 115200
 RC: Final = (7 + 115) * _BYTE
 RD: Final = (7 + 63) * _BYTE
@@ -25,7 +25,7 @@ INTERVAL: Final = 2.0
 LATE: Final = 50.0
 """Aim, ms."""
 OVER: Final = 1.15
-"""Aim: 1.6 ms an exchange beyond wire and turn-round, which is what `abl-scan` may have."""
+"""Aim: 1.6 ms for each exchange beyond wire and turn-round, as in `abl-scan`."""
 
 METHOD = f"""\
 One virtual EWS-Box in a process of its own on a pty paced at 115200 8N1, library alone,
@@ -66,8 +66,8 @@ async def _periods(
     ports: Iterable[int], *, interval: float, seconds: float
 ) -> list[float]:
     """Poll for a while; return the periods, s."""
-    async with Witness("ews", boxes=[{"plugged": True}]) as witness:
-        bus = ews_bus(witness.url, ports, poll_interval=interval)
+    async with Oracle("ews", boxes=[{"plugged": True}]) as oracle:
+        bus = ews_bus(oracle.url, ports, poll_interval=interval)
         await bus.start()
         try:
             await settled(bus)
@@ -75,15 +75,15 @@ async def _periods(
             await asyncio.sleep(seconds)
         finally:
             await bus.stop()
-        return gaps(polls(await witness.log(since)))
+        return gaps(polls(await oracle.log(since)))
 
 
-def polls(log: Sequence[Heard]) -> list[float]:
-    """Return when the box was asked how its ports are."""
+def polls(log: Sequence[LoggedFrame]) -> list[float]:
+    """Return the start times of the polls of the box."""
     return [
-        heard.start
-        for heard in log
-        if heard.from_client and heard.data[3:6] == PORTS_REQUEST
+        frame.start
+        for frame in log
+        if frame.from_client and frame.data[3:6] == PORTS_REQUEST
     ]
 
 

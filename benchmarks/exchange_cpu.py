@@ -1,4 +1,4 @@
-"""(d) Processor time an exchange costs, beside another client's on the same pty."""
+"""(d) Processor time of an exchange, compared with another client on the same pty."""
 
 import asyncio
 import contextlib
@@ -23,21 +23,21 @@ NAME = "exchange-cpu"
 _figure = partial(Figure, NAME, digits=0)
 METHOD = """\
 Processor time (user and system) of the whole process over N reads of 5 registers from
-0x002E, an answer of 31 bytes each, other values each time; the device is another
-process on the same pty and answers at once with ready-made frames. Ours: the whole
-path (bus, schedule, ABL charger, frame, plausible reading, a listener). Beside it:
-tmodbus' ASCII client as its own factory makes it, returning five numbers. It sleeps
-for 1 ms between frames when the answer was faster than that; a third row is without.
-In turns, median of all rounds; once with answers in one piece, once in pieces of 7 bytes 2 ms
-apart, as a line at 38400 Bd delivers them. GC as Python has it."""
+0x002E, a reply of 31 bytes each, other values each time; the device is another process
+on the same pty and replies at once with prepared frames. Ours: the whole path (bus,
+schedule, ABL charger, frame, plausible reading, a listener). Compared with: tmodbus'
+ASCII client as its own factory makes it, returning five numbers. It sleeps for 1 ms
+between frames when the reply was faster than that; a third row is without. In turns,
+median of all rounds; once with replies in one piece, once in pieces of 7 bytes 2 ms
+apart, as a line at 38400 Bd delivers them. Garbage collection as Python has it."""
 
 _PIECES = LineSettings(baudrate=38400)
 _AT_ONCE = LineSettings(baudrate=4_000_000)
-"""What the client is told of the line: at 38400 Bd it would wait, before the next
-request, until this one can have left. Without parity: a pty takes an 8E1 open only
-once (see tests/virtual/ports.py)."""
+"""The line settings of the client: at 38400 Bd it would wait before each request until
+the last one has left. Without parity: a pty accepts an 8E1 open only once (see
+tests/virtual/ports.py)."""
 _REGISTER = 0x2E
-_WHO = ("evse_bus", "tmodbus", "tmodbus without its pause between frames")
+_CLIENTS = ("evse_bus", "tmodbus", "tmodbus without its pause between frames")
 _PATIENCE = 5.0
 
 
@@ -60,8 +60,10 @@ async def run(*, quick: bool) -> list[Figure]:
                     hasty = await _tmodbus(responder.url, line, theirs, exchanges)
                 times.append((mine, other, hasty))
             figures += [
-                _figure(f"{who}, answers {name}", median(column) * 1e6, "us")
-                for who, column in zip(_WHO, zip(*times, strict=True), strict=True)
+                _figure(f"{client}, answers {name}", median(column) * 1e6, "us")
+                for client, column in zip(
+                    _CLIENTS, zip(*times, strict=True), strict=True
+                )
             ]
             figures.append(
                 _figure(
@@ -99,7 +101,7 @@ async def _ours(url: str, line: LineSettings, unit: int, exchanges: int) -> floa
 
 
 async def _start(bus: Bus) -> None:
-    """Start a bus, as soon as the client before has let go of the port."""
+    """Start a bus, as soon as the client before has closed the port."""
     async with asyncio.timeout(_PATIENCE):
         while True:
             try:

@@ -1,4 +1,4 @@
-"""Figures: statistics, the table a person reads, and results.json. Pure."""
+"""Figures: statistics, the table, and results.json. Pure."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass
@@ -16,7 +16,7 @@ class Figure:
     unit: str = ""
     _: KW_ONLY
     aim: float | None = None
-    """The value must not be greater; ``None``: told for its own sake."""
+    """The value must not be greater; ``None``: no aim."""
     digits: int = 1
     note: str = ""
 
@@ -38,12 +38,12 @@ class Figure:
         return f"<= {self.aim:.{self.digits}f} {'yes' if self.met else 'NO'}"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what is written to results.json."""
+        """Return the item for results.json."""
         return {**asdict(self), "met": self.met}
 
 
 def percentile(values: Sequence[float], share: float) -> float:
-    """Return the smallest value that so many (0..1) of them do not exceed.
+    """Return the smallest value that this share (0..1) of them does not exceed.
 
     The nearest-rank method: always one of the values. Raises ValueError for none.
     """
@@ -66,7 +66,7 @@ _RIGHT = 2
 
 
 def table(figures: Iterable[Figure]) -> str:
-    """Return the figures as a table in Markdown, aligned for reading as it is."""
+    """Return the figures as a table in Markdown, aligned for a terminal."""
     rows: list[tuple[str, ...]] = [_HEADS]
     before = ""
     for one in figures:
@@ -98,7 +98,7 @@ def results(
     *,
     quick: bool,
 ) -> dict[str, Any]:
-    """Return what is written to results.json."""
+    """Return the item for results.json."""
     return {
         "machine": dict(machine),
         "quick": quick,

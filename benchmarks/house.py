@@ -1,8 +1,8 @@
 """A real Home Assistant, started for a benchmark in a process of its own.
 
 As a program: ``python -m benchmarks.house FOLDER`` starts Home Assistant with that
-configuration folder, as `homeassistant.runner` does, and then does what it reads from
-stdin (a line of JSON each, answered by one). As a module: `House` starts that.
+configuration folder, as `homeassistant.runner` does, and executes commands from stdin
+(a line of JSON each; so is its result). As a module: `House` starts such a process.
 """
 
 import asyncio
@@ -38,7 +38,7 @@ class House:
     """A Home Assistant in another process."""
 
     def __init__(self) -> None:
-        """Start nothing yet."""
+        """Prepare; nothing is started."""
         self._folder = tempfile.TemporaryDirectory(prefix="evse-bus-bench-")
         self._process: asyncio.subprocess.Process | None = None
 
@@ -61,11 +61,11 @@ class House:
                 limit=_LINE_LIMIT,
             )
         async with asyncio.timeout(_STARTS_WITHIN):
-            await self._answer()
+            await self._result()
         return self
 
     async def __aexit__(self, *_error: object) -> None:
-        """Stop it and delete what it stored."""
+        """Stop it and delete its folder."""
         process = self._process
         if process is not None and process.stdin is not None:
             process.stdin.close()
@@ -78,16 +78,16 @@ class House:
         self._folder.cleanup()
 
     async def do(self, command: str, **arguments: object) -> Any:  # noqa: ANN401 - JSON
-        """Have a command carried out there (`house_commands`); return its answer."""
+        """Execute a command there (`house_commands`); return its result."""
         if self._process is None or self._process.stdin is None:
             message = "Home Assistant is not running"
             raise RuntimeError(message)
         line = json.dumps({"command": command, "arguments": arguments})
         self._process.stdin.write(line.encode() + b"\n")
         await self._process.stdin.drain()
-        return await self._answer()
+        return await self._result()
 
-    async def _answer(self) -> Any:  # noqa: ANN401 - JSON
+    async def _result(self) -> Any:  # noqa: ANN401 - JSON
         if self._process is None or self._process.stdout is None:
             message = "Home Assistant is not running"
             raise RuntimeError(message)
@@ -99,7 +99,7 @@ class House:
 
 
 def free_port() -> int:
-    """Return a TCP port of this machine that nobody uses."""
+    """Return a free TCP port of this machine."""
     with socket.socket() as one:
         one.bind(("127.0.0.1", 0))
         port: int = one.getsockname()[1]
@@ -110,7 +110,7 @@ def free_port() -> int:
 
 
 async def _serve(folder: str) -> None:
-    # Home Assistant is loaded by the process that runs it only.
+    # Only the process that runs Home Assistant imports it.
     from homeassistant.bootstrap import async_setup_hass  # noqa: PLC0415
     from homeassistant.runner import RuntimeConfig  # noqa: PLC0415
 
@@ -126,9 +126,9 @@ async def _serve(folder: str) -> None:
     )
     commands = {**COMMANDS, **FOR_BOXES}
     while line := await reader.readline():
-        asked = json.loads(line)
-        answer = await commands[asked["command"]](hass, **asked["arguments"])
-        print(json.dumps(answer), flush=True)
+        order = json.loads(line)
+        result = await commands[order["command"]](hass, **order["arguments"])
+        print(json.dumps(result), flush=True)
     await hass.async_stop()
 
 

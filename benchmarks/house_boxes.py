@@ -1,4 +1,4 @@
-"""What a real Home Assistant is asked to do with EWS-Boxes; in its own process.
+"""Commands for a real Home Assistant with EWS-Boxes, in its own process.
 
 As in `house_commands`. Times are s of CLOCK_MONOTONIC.
 """
@@ -12,10 +12,10 @@ from typing import Any, Final
 from .blocks import watch
 from .house_commands import add_entry
 
-_LOOK: Final = 0.02
-"""Pause between two looks at whether all boxes are there, s."""
+_CHECK_PAUSE: Final = 0.02
+"""Pause between two checks whether all boxes are available, s."""
 _PAUSES: Final = (0.02, 0.1)
-"""Shortest and longest time between two commands of a busy house, s."""
+"""Shortest and longest time between two commands on a busy bus, s."""
 _CURRENTS: Final = (6, 16, 10, 13)
 """A"""
 
@@ -31,7 +31,7 @@ def _find(
     platform: str,
     key: str,
 ) -> str | None:
-    """Return the id of one of a port's entities, if it is there."""
+    """Return the id of an entity of a port, if it exists."""
     from homeassistant.helpers import entity_registry as er  # noqa: PLC0415
 
     found: str | None = er.async_get(hass).async_get_entity_id(
@@ -46,15 +46,15 @@ def _entity_of(
     platform: str,
     key: str,
 ) -> str:
-    """Return the id of one of a port's entities, which must be there."""
+    """Return the id of an entity of a port; raises LookupError."""
     if (found := _find(hass, managed, platform, key)) is None:
         message = f"{managed.name} has no {platform} {key}"
         raise LookupError(message)
     return found
 
 
-def _is_there(hass: Any, managed: Any) -> bool:  # noqa: ANN401
-    """Return whether a person sees in what state a port is."""
+def _is_available(hass: Any, managed: Any) -> bool:  # noqa: ANN401
+    """Return whether the status of a port is available."""
     entity = _find(hass, managed, "sensor", "status")
     state = hass.states.get(entity) if entity else None
     return state is not None and state.state not in ("unavailable", "unknown")
@@ -67,31 +67,31 @@ async def _until(
     since: float,
     patience: float = 180.0,
 ) -> float:
-    """Wait until all ports are there, or none; return how long it took, s."""
+    """Wait until all ports are available, or none; return the time it took, s."""
     async with asyncio.timeout(patience):
         while True:
-            # A look costs little; to be told of each of thousands of changes, much.
+            # A check costs little; a listener for thousands of changes, much.
             if all(
-                _is_there(hass, managed) is available for managed in _chargers(hass)
+                _is_available(hass, managed) is available for managed in _chargers(hass)
             ):
                 return time.monotonic() - since
-            await asyncio.sleep(_LOOK)
+            await asyncio.sleep(_CHECK_PAUSE)
 
 
 async def _add_boxes(
     hass: Any,  # noqa: ANN401
-    **about: Any,  # noqa: ANN401
+    **options: Any,  # noqa: ANN401
 ) -> dict[str, Any]:
-    """Add a bus or a listener; return how long until all ports are there, and blocks."""
+    """Add a bus or a listener; return the time until all ports are available, blocks."""
     with watch() as blocks:
         since = time.monotonic()
-        await add_entry(hass, **about)
+        await add_entry(hass, **options)
         took = await _until(hass, available=True, since=since)
     return {"took": took, **blocks.as_dict()}
 
 
 async def _reload(hass: Any) -> dict[str, Any]:  # noqa: ANN401
-    """Set everything up anew; return how long until all ports are there, and blocks."""
+    """Reload all entries; return the time until all ports are available, and blocks."""
     with watch() as blocks:
         since = time.monotonic()
         for entry in hass.config_entries.async_entries("evse_bus"):
@@ -107,7 +107,7 @@ async def _remove(hass: Any) -> None:  # noqa: ANN401
 
 
 async def _charge(hass: Any) -> float:  # noqa: ANN401
-    """Let all ports charge by one call; return how long it took, s."""
+    """Let all ports charge by one call; return the time it took, s."""
     switches = [
         _entity_of(hass, managed, "switch", "charging_allowed")
         for managed in _chargers(hass)
@@ -120,7 +120,7 @@ async def _charge(hass: Any) -> float:  # noqa: ANN401
 
 
 async def _statistics(hass: Any) -> dict[str, int]:  # noqa: ANN401
-    """Return what all buses have counted together, and the listener."""
+    """Return the sums of the counters of all buses, and those of the listener."""
     total = dict.fromkeys(
         ("requests", "timeouts", "missed_deadlines", "bad_frames", "reopened"), 0
     )
@@ -143,9 +143,9 @@ async def _watch_states(
     key: str,
     busy: bool,
 ) -> dict[str, Any]:
-    """Return which states the entities of this key have got meanwhile, and when.
+    """Return the new states of the entities of this key, with their times.
 
-    Of an event the state is its type. ``busy``: set currents all the time.
+    For an event entity the state is the event type. ``busy``: set currents all the time.
     """
     from homeassistant.core import callback  # noqa: PLC0415
 
@@ -160,8 +160,8 @@ async def _watch_states(
         port = ports.get(event.data["entity_id"])
         new = event.data["new_state"]
         if port is not None and new is not None:
-            what = new.attributes.get("event_type", new.state)
-            seen.append((time.monotonic(), port, what))
+            state = new.attributes.get("event_type", new.state)
+            seen.append((time.monotonic(), port, state))
 
     stop = hass.bus.async_listen("state_changed", note)
     until = time.monotonic() + seconds
@@ -174,7 +174,7 @@ async def _watch_states(
 
 
 async def _command(hass: Any, until: float) -> tuple[int, int]:  # noqa: ANN401
-    """Set the current of each port in turn; return how often, and how often in vain."""
+    """Set the current of each port in turn; return the numbers of calls and failures."""
     from homeassistant.exceptions import HomeAssistantError  # noqa: PLC0415
 
     numbers = [
@@ -185,13 +185,13 @@ async def _command(hass: Any, until: float) -> tuple[int, int]:  # noqa: ANN401
     given = refused = 0
     while time.monotonic() < until:
         await asyncio.sleep(dice.uniform(*_PAUSES))
-        about = {
+        values = {
             "entity_id": numbers[given % len(numbers)],
             "value": _CURRENTS[given // len(numbers) % len(_CURRENTS)],
         }
         given += 1
         try:
-            await hass.services.async_call("number", "set_value", about, blocking=True)
+            await hass.services.async_call("number", "set_value", values, blocking=True)
         except HomeAssistantError:
             refused += 1
     return given, refused
@@ -209,12 +209,12 @@ COMMANDS: Final[dict[str, Callable[..., Any]]] = {
 
 
 def box_entry(
-    serials: Sequence[str], *, interval: float, **where: str | int
+    serials: Sequence[str], *, interval: float, **address: str | int
 ) -> dict[str, Any]:
-    """Return what `add_boxes` takes: boxes of two ports, on a port or a listener."""
+    """Return arguments of `add_boxes`: boxes of two ports, on a port or a listener."""
     return {
-        "protocol": "ews" if "device" in where else "ews_network",
-        **where,
+        "protocol": "ews" if "device" in address else "ews_network",
+        **address,
         "chargers": [
             {
                 "address": serial,

@@ -1,7 +1,7 @@
-"""What a real Home Assistant is asked to do by benchmarks; in its own process.
+"""Commands for a real Home Assistant, in its own process.
 
-Each command takes `hass`, which is not imported here: Home Assistant is loaded by the
-process that runs it only.
+Each command takes `hass`; its type is not imported here, because only the process that
+runs Home Assistant imports it.
 """
 
 import asyncio
@@ -19,12 +19,12 @@ from .blocks import watch
 
 async def _add(
     hass: Any,  # noqa: ANN401 - not imported here
-    **about: Any,  # noqa: ANN401 - of all kinds
+    **options: Any,  # noqa: ANN401 - of all kinds
 ) -> None:
     """Add a bus and its chargers (see `add_entry`); wait until they are known."""
     from .setup import settled  # noqa: PLC0415
 
-    entry = await add_entry(hass, **about)
+    entry = await add_entry(hass, **options)
     await settled(entry.runtime_data.bus)
     await hass.async_block_till_done()
 
@@ -34,11 +34,11 @@ async def add_entry(
     *,
     protocol: str,
     chargers: Sequence[Mapping[str, Any]],
-    **where: str | int,
+    **address: str | int,
 ) -> Any:  # noqa: ANN401 - not imported here
     """Add a bus and its chargers as the config flow stores them; return the entry.
 
-    ``where``: its port, or where it listens.
+    ``address``: its port, or the address of its listener.
     """
     from homeassistant.config_entries import (  # noqa: PLC0415
         ConfigEntry,
@@ -48,7 +48,7 @@ async def add_entry(
     from custom_components.evse_bus.configuration import charger_unique_id  # noqa: PLC0415
 
     entry = ConfigEntry(
-        data={"protocol": protocol, **where},
+        data={"protocol": protocol, **address},
         discovery_keys=MappingProxyType({}),
         domain="evse_bus",
         minor_version=1,
@@ -72,7 +72,7 @@ async def add_entry(
 
 
 async def _count(hass: Any) -> dict[str, int]:  # noqa: ANN401
-    """Return how many states there are, and how many of them are available."""
+    """Return the number of states, and of those that are available."""
     states = hass.states.async_all()
     return {
         "states": len(states),
@@ -81,7 +81,7 @@ async def _count(hass: Any) -> dict[str, int]:  # noqa: ANN401
 
 
 async def _cost(hass: Any, *, seconds: float) -> dict[str, float]:  # noqa: ANN401
-    """Return the share of one core, the memory, and what happened meanwhile."""
+    """Return the share of one core, the memory, and the rate of state changes."""
     changes = 0
 
     def count(_event: object) -> None:
@@ -110,7 +110,7 @@ def _resident() -> float:
 
 
 async def _blocks(_hass: object, *, seconds: float) -> dict[str, Any]:
-    """Return how long single callbacks have held the event loop."""
+    """Return the times that single callbacks held the event loop."""
     with watch() as blocks:
         await asyncio.sleep(seconds)
     return blocks.as_dict()
@@ -119,7 +119,7 @@ async def _blocks(_hass: object, *, seconds: float) -> dict[str, Any]:
 async def _watched_add(
     hass: object, *, buses: Sequence[Mapping[str, Any]]
 ) -> dict[str, Any]:
-    """Add buses; return how long single callbacks have held the loop meanwhile."""
+    """Add buses; return the times that single callbacks held the loop meanwhile."""
     with watch() as blocks:
         for bus in buses:
             await _add(hass, **bus)
@@ -133,7 +133,7 @@ async def _set_values(
     values: Sequence[float],
     seed: int = 1,
 ) -> list[tuple[int, float, float, float]]:
-    """Call number.set_value again and again: device-ID, value, before and after, s."""
+    """Call number.set_value; return device-ID, value, start and end (s) of each call."""
     from homeassistant.helpers import entity_registry as er  # noqa: PLC0415
 
     registry = er.async_get(hass)
@@ -153,7 +153,7 @@ async def _set_values(
         # Each box in turn, all of them to one value, then all to the next.
         address, entity = numbers[at % len(numbers)]
         value = values[at // len(numbers) % len(values)]
-        # A call comes at any moment of the bus's round.
+        # A call comes at any moment of a round of the bus.
         await asyncio.sleep(0.05 + 0.2 * dice.random())
         before = time.monotonic()
         await hass.services.async_call(

@@ -1,4 +1,4 @@
-"""What the figures were taken on."""
+"""The machine and the versions behind the figures."""
 
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -13,7 +13,7 @@ PACKAGES = ("homeassistant", "serialx", "pymodbus", "tmodbus")
 
 
 def machine() -> dict[str, str | int | float]:
-    """Return processor, cores, load, system, Python and the versions that matter."""
+    """Return processor, cores, load, system, Python and versions of packages."""
     return {
         "processor": _processor(),
         "cores": os.cpu_count() or 0,

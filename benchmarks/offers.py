@@ -1,8 +1,8 @@
-"""Virtual SmartEVSEs that keep a diary of what they offer their cars.
+"""Virtual SmartEVSEs that record their offers.
 
-The diary is of the box itself: what its pilot says and whether its contactor is
-closed, noted whenever a frame or time has changed it. A frame changes it 3 ms after
-its last byte; what the box does by itself is seen within the 50 ms of the bus's tick.
+The box itself records the current of its pilot and the state of its contactor whenever
+they change. A frame changes them 3 ms after its last byte; other changes are recorded
+within the 50 ms of the tick of the bus.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,35 +15,35 @@ from tests.virtual.device import Device
 
 @dataclass(frozen=True, slots=True)
 class Offer:
-    """What a box offers from a moment on (s of CLOCK_MONOTONIC)."""
+    """The offer of a box from a time on (s of CLOCK_MONOTONIC)."""
 
     at: float
     name: str
     amps: float
-    """By its pilot; 0: no PWM."""
+    """Of its pilot; 0: no PWM."""
     closed: bool
-    """Its contactor is: a car can draw that much."""
+    """Its contactor is closed: a car can draw this current."""
 
 
-class DiarySmartEvse(SmartEvse):
-    """A SmartEVSE with a diary."""
+class RecordingSmartEvse(SmartEvse):
+    """A SmartEVSE that records its offers."""
 
-    def __init__(self, **about: Any) -> None:  # noqa: ANN401 - as `SmartEvse` has them
-        """Begin with an empty diary."""
-        super().__init__(**about)
+    def __init__(self, **options: Any) -> None:  # noqa: ANN401 - those of `SmartEvse`
+        """Begin without an offer."""
+        super().__init__(**options)
         self.offers: list[Offer] = []
 
     @override
     def step(self) -> None:
         super().step()
-        self._note()
+        self._record()
 
     @override
     def _take_frame(self) -> None:
         super()._take_frame()
-        self._note()
+        self._record()
 
-    def _note(self) -> None:
+    def _record(self) -> None:
         if self.bus is None:
             return
         now = Offer(self.bus.time(), self.name, self.pilot_current, self.contactor)
@@ -55,27 +55,27 @@ class DiarySmartEvse(SmartEvse):
 def smartevse_boxes(boxes: Sequence[Mapping[str, Any]]) -> list[Device]:
     """Make boxes, each with a car of 32 A.
 
-    ``car``: "plugged" charges for ever; else what `CarLife` is made with, and it comes
-    and goes by itself. All else is for `SmartEvse`.
+    ``car``: "plugged" charges for ever; else the arguments of a `CarLife`, by which it
+    comes and goes. All other items are arguments of `SmartEvse`.
     """
     devices: list[Device] = []
     for box in boxes:
-        about = dict(box)
-        habits = about.pop("car")
-        plugged = habits == "plugged"
-        car = Car(max_current=32.0, life=None if plugged else CarLife(**habits))
+        options = dict(box)
+        life = options.pop("car")
+        plugged = life == "plugged"
+        car = Car(max_current=32.0, life=None if plugged else CarLife(**life))
         if plugged:
             car.plug_in()
-        devices.append(DiarySmartEvse(car=car, **about))
+        devices.append(RecordingSmartEvse(car=car, **options))
     return devices
 
 
 def offers_of(devices: Sequence[Device]) -> list[Offer]:
-    """Return all diaries as one, by time (on the bus thread)."""
+    """Return the offers of all boxes, by time (on the bus thread)."""
     entries = [
         offer
         for device in devices
-        if isinstance(device, DiarySmartEvse)
+        if isinstance(device, RecordingSmartEvse)
         for offer in device.offers
     ]
     return sorted(entries, key=lambda offer: offer.at)

@@ -1,4 +1,4 @@
-"""What is going on, for the person who waits."""
+"""Progress on stderr."""
 
 import sys
 import time

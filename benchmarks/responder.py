@@ -1,10 +1,10 @@
 """A small Modbus ASCII device for comparing two clients on one pty.
 
-``python -m benchmarks.responder``: prints its path and answers until stdin ends.
-Answers are those of an ABL box that charges, its current another one each time.
-Device-ID 1 answers with ``>`` as ABL does, device-ID 2 with ``:`` as Modbus has it;
-3 and 4 do the same in pieces, as they come from a line at 38400 Bd (2 ms each).
-The answers are ready made, so that the device costs next to nothing.
+``python -m benchmarks.responder``: prints its path and replies until stdin ends.
+Replies are those of an ABL box that charges, with a different current each time.
+Device-ID 1 replies with ``>`` as ABL does, device-ID 2 with ``:`` as in Modbus; 3 and 4
+do the same in pieces, as they come from a line at 38400 Bd (2 ms each). The replies are
+prepared in advance, so that the device takes hardly any processor time.
 """
 
 import asyncio
@@ -30,7 +30,7 @@ _FIXED = {
     b"00060002": "06C28000",
     b"00500008": "5000" + b"2W22xy00000001".hex(),
 }
-"""Register and count, and what is in these registers."""
+"""Register and count, and the contents of these registers."""
 _CURRENTS = range(60, 160)
 
 
@@ -38,7 +38,7 @@ class Responder:
     """The device in another process."""
 
     def __init__(self) -> None:
-        """Start nothing yet."""
+        """Prepare; nothing is started."""
         self._process: asyncio.subprocess.Process | None = None
         self.url = ""
 
@@ -85,13 +85,13 @@ def _main() -> None:
         )
         for unit in _STARTS
     }
-    heard = b""
+    frame = b""
     while True:
-        heard += os.read(master, 256)
-        if not heard.endswith(b"\r\n"):
+        frame += os.read(master, 256)
+        if not frame.endswith(b"\r\n"):
             continue
-        unit, question = int(heard[1:3], 16), heard[5:13]
-        heard = b""
+        unit, question = int(frame[1:3], 16), frame[5:13]
+        frame = b""
         if question == b"002E0005":
             _say(master, next(readings[unit]), unit)
         elif (unit, question) in fixed:

@@ -1,4 +1,4 @@
-"""From a set-point to what the box offers its car, and to what it is read back."""
+"""Times from a set-point to the offer of the box, and to its confirmation."""
 
 import asyncio
 from collections.abc import Sequence
@@ -12,8 +12,8 @@ from custom_components.evse_bus.evse.model import OrderChange
 
 from .figures import Figure, percentile
 from .offers import Offer
+from .oracle import Oracle
 from .setup import SMARTEVSE_LIMIT
-from .witness import Witness
 
 LOW: Final = 6.0
 HIGH: Final = SMARTEVSE_LIMIT
@@ -47,17 +47,17 @@ async def set_points(
         begin, error = loop.time(), ""
         try:
             await charger.change_orders(OrderChange(current=amps))
-        except EvseError as why:
-            error = f"{type(why).__name__}: {why}"
+        except EvseError as failure:
+            error = f"{type(failure).__name__}: {failure}"
         called.append(Called(charger.config.key, amps, begin, loop.time(), error))
     return called
 
 
-async def until_all_charge(witness: Witness, chargers: Sequence[Charger]) -> None:
-    """Wait until each box offers all that it may."""
+async def until_all_charge(oracle: Oracle, chargers: Sequence[Charger]) -> None:
+    """Wait until each box offers its full current."""
     async with asyncio.timeout(CHARGES_WITHIN):
         while True:
-            if _all_charge(await witness.offers(), chargers):
+            if _all_charge(await oracle.offers(), chargers):
                 return
             await asyncio.sleep(0.2)
 
@@ -68,7 +68,7 @@ def _all_charge(offers: Sequence[Offer], chargers: Sequence[Charger]) -> bool:
 
 
 def offered_after(called: Called, offers: Sequence[Offer]) -> float | None:
-    """Return how long it took the box to offer it, s; ``None``: it never did."""
+    """Return the time until the box offered it, s; ``None``: never."""
     for offer in offers:
         if (
             (offer.name, offer.amps) == (called.name, called.amps)
@@ -80,9 +80,9 @@ def offered_after(called: Called, offers: Sequence[Offer]) -> float | None:
 
 
 def set_point_figures(
-    benchmark: str, what: str, called: Sequence[Called], offers: Sequence[Offer]
+    benchmark: str, prefix: str, called: Sequence[Called], offers: Sequence[Offer]
 ) -> list[Figure]:
-    """Return how long raises and lowerings took."""
+    """Return the times of raises and lowerings."""
     figures: list[Figure] = []
     for name, amps in (("raise", HIGH), ("lowering", LOW)):
         these = [one for one in called if one.amps == amps]
@@ -96,7 +96,7 @@ def set_point_figures(
             figures += [
                 Figure(
                     benchmark=benchmark,
-                    name=f"{what}{name} to {kind}, {words}",
+                    name=f"{prefix}{name} to {kind}, {words}",
                     value=percentile(seconds, share) * 1000,
                     unit="ms",
                     digits=0,
@@ -108,7 +108,7 @@ def set_point_figures(
     figures.append(
         Figure(
             benchmark=benchmark,
-            name=f"{what}set-points that were not confirmed",
+            name=f"{prefix}set-points that were not confirmed",
             value=sum(bool(one.error) for one in called),
             aim=0,
             digits=0,

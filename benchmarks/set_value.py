@@ -1,4 +1,4 @@
-"""(c) From `number.set_value` to the wire, on an ABL bus of 16 that is never idle."""
+"""(c) Time from `number.set_value` to the wire, on a busy bus of 16 ABL boxes."""
 
 import asyncio
 from collections.abc import Sequence
@@ -7,19 +7,19 @@ from statistics import fmean
 
 from .figures import Figure, percentile
 from .house import LOADED, House
+from .oracle import LoggedFrame, Oracle
 from .progress import say
 from .setup import ABL_LIMIT, LIMIT_REQUEST, unit_of
-from .witness import Heard, Witness
 
 NAME = "set-value"
 METHOD = f"""\
 A real Home Assistant ({LOADED}) with the integration, 16 virtual ABL boxes in a process
 of their own on a pty paced at 38400 8E1, poll interval 0: the bus is never idle. The
 service number.set_value is called in the process of Home Assistant at random moments,
-box by box, 16 A and 6 A in turn. Time from the call to the first byte on the wire as
-the virtual bus's log has it (one monotonic clock). A lowering is on disk before it is
-sent. 'Own turn': the first request made for the call (the library reads the box before
-it writes a limit); 'limit': the write that carries it. Beside it the exchange that was
+box by box, 16 A and 6 A in turn. Time from the call to the first byte on the wire, by
+the virtual bus's log (one monotonic clock). A lowering is on disk before it is sent.
+'Own turn': the first request made for the call (the library reads the box before it
+writes a limit); 'limit': the write of the limit. For comparison, the exchange that was
 in progress at the call."""
 
 LOW = 6.0
@@ -27,7 +27,7 @@ LOW = 6.0
 
 @dataclass(frozen=True, slots=True)
 class _Call:
-    """One call and what became of it, s."""
+    """One call and its times, s."""
 
     raises: bool
     turn: float
@@ -39,18 +39,18 @@ class _Call:
     in_progress: float
     """Length of the exchange under way at the call."""
     rest: float
-    """What was left of it."""
+    """The rest of it after the call."""
 
 
 async def run(*, quick: bool) -> list[Figure]:
     """Return the figures."""
     ids = list(range(1, 17))
     say("starting Home Assistant")
-    async with Witness("abl", ids=ids) as witness, House() as house:
+    async with Oracle("abl", ids=ids) as oracle, House() as house:
         await house.do(
             "add",
             protocol="abl",
-            device=witness.url,
+            device=oracle.url,
             chargers=[
                 {
                     "address": one,
@@ -67,12 +67,12 @@ async def run(*, quick: bool) -> list[Figure]:
         say(f"{times} times number.set_value")
         called = await house.do("set_values", times=times, values=[ABL_LIMIT, LOW])
         await asyncio.sleep(0.1)
-        log = await witness.log()
+        log = await oracle.log()
     calls = [
         _seen(log, unit, before, after, raises=value > LOW)
         for unit, value, before, after in called
     ]
-    # Each box's first one is a raise from where it has been put at the start.
+    # The first call for each box is a raise from its value at the start.
     return [
         *_figures("raise", [one for one in calls if one.raises]),
         *_figures("lowering", [one for one in calls if not one.raises]),
@@ -122,25 +122,25 @@ def _milliseconds(
 
 
 def _seen(
-    log: Sequence[Heard], unit: int, before: float, after: float, *, raises: bool
+    log: Sequence[LoggedFrame], unit: int, before: float, after: float, *, raises: bool
 ) -> _Call:
-    """Find in the log what a call has brought about."""
-    requests = [heard for heard in log if heard.from_client and heard.start <= after]
+    """Find the exchanges of a call in the log."""
+    requests = [frame for frame in log if frame.from_client and frame.start <= after]
     at = next(
         index
-        for index, heard in enumerate(requests)
-        if heard.start >= before
-        and unit_of(heard) == unit
-        and heard.data[3:9] == LIMIT_REQUEST
+        for index, frame in enumerate(requests)
+        if frame.start >= before
+        and unit_of(frame) == unit
+        and frame.data[3:9] == LIMIT_REQUEST
     )
     write = requests[at]
     first = at
-    # What was said to this box just before, since the call, is the same turn.
+    # Requests to this box just before, since the call, belong to the same turn.
     while requests[first - 1].start >= before and unit_of(requests[first - 1]) == unit:
         first -= 1
-    under_way = [heard for heard in log if before - 1.0 <= heard.start <= before]
+    under_way = [frame for frame in log if before - 1.0 <= frame.start <= before]
     request = max(
-        (heard for heard in under_way if heard.from_client), key=lambda one: one.start
+        (frame for frame in under_way if frame.from_client), key=lambda one: one.start
     )
     reply = min(
         (one for one in log if not one.from_client and one.start >= request.end),

@@ -22,7 +22,7 @@ from custom_components.evse_bus.evse.smartevse import (
     SlaveConfig,
 )
 
-from .witness import Heard
+from .oracle import LoggedFrame
 
 ABL_LIMIT: Final = 16.0
 EVBOX_LIMIT: Final = 320.0
@@ -30,13 +30,13 @@ EVBOX_LIMIT: Final = 320.0
 EWS_LIMIT: Final = 16.0
 SMARTEVSE_LIMIT: Final = 16.0
 SETTLED_AFTER: Final = 1.5
-"""So long without a time-out means that all boxes have been found out about, s."""
+"""Time without a time-out after which all boxes are known, s."""
 SETTLES_WITHIN: Final = 60.0
 
 READING_REQUEST: Final = b"03002E0005"
-"""What a regular read of an ABL box has behind its device-ID."""
+"""The bytes after the device-ID in a regular read of an ABL box."""
 LIMIT_REQUEST: Final = b"100014"
-"""What a write of an ABL box's limit has behind its device-ID."""
+"""The bytes after the device-ID in a write of the limit of an ABL box."""
 
 
 def abl_bus(
@@ -46,7 +46,7 @@ def abl_bus(
     poll_interval: float = 0.0,
     settings: LineSettings | None = None,
 ) -> Bus:
-    """Return a bus with wallboxes on it that are polled without pause."""
+    """Return a bus with wallboxes that are polled without pause."""
     bus = ABL.bus(url, settings=settings)
     for number in ids:
         config = AblConfig(
@@ -62,7 +62,7 @@ def abl_bus(
 
 
 def evbox_bus(url: str, serials: Iterable[int], *, period: float, timeout: int) -> Bus:
-    """Return a bus with ChargePoints on it."""
+    """Return a bus with ChargePoints."""
     bus = EVBOX.bus(url)
     for serial in serials:
         config = EvboxConfig(
@@ -80,7 +80,7 @@ def evbox_bus(url: str, serials: Iterable[int], *, period: float, timeout: int) 
 
 
 def ews_bus(url: str, ports: Iterable[int], *, poll_interval: float) -> Bus:
-    """Return the bus of an EWS-Box, with so many of its ports."""
+    """Return the bus of an EWS-Box, with these ports."""
     bus = EWS.bus(url)
     for port in ports:
         config = EwsPortConfig(
@@ -108,7 +108,7 @@ def smartevse_bus(url: str, unit: int) -> Bus:
 
 
 def master_bus(url: str, units: Iterable[int], supply: float) -> Bus:
-    """Return a bus with slaves on it that share a supply, A."""
+    """Return a bus with slaves that share a supply (A)."""
     bus = MASTER.bus(url, circuit=Circuit(limit=supply))
     for unit in units:
         config = SlaveConfig(
@@ -126,7 +126,7 @@ def _smartevse_orders() -> Orders:
 
 
 async def settled(bus: Bus, dead: Iterable[str] = ()) -> None:
-    """Wait until the living are known and the dead are given up."""
+    """Wait until the chargers that answer are known and the dead ones unavailable."""
     gone = set(dead)
     statistics = bus.wire.statistics
     loop = asyncio.get_running_loop()
@@ -147,15 +147,15 @@ def _is_given_up(charger: Charger) -> bool:
     return charger.misses >= charger.timing.misses
 
 
-def unit_of(request: Heard) -> int:
-    """Return the device-ID that an ABL request is for."""
+def unit_of(request: LoggedFrame) -> int:
+    """Return the device-ID of an ABL request."""
     return int(request.data[1:3], 16)
 
 
-def starts_of(log: Iterable[Heard], unit: int, kind: bytes) -> list[float]:
-    """Return when requests of a kind to a box began."""
+def starts_of(log: Iterable[LoggedFrame], unit: int, kind: bytes) -> list[float]:
+    """Return the start times of requests of a kind to a box."""
     return [
-        heard.start
-        for heard in log
-        if heard.from_client and unit_of(heard) == unit and heard.data[3:13] == kind
+        frame.start
+        for frame in log
+        if frame.from_client and unit_of(frame) == unit and frame.data[3:13] == kind
     ]

@@ -1,4 +1,4 @@
-"""The pure parts of the benchmarks; their figures are not for tests."""
+"""The pure parts of the benchmarks; their figures are not tested."""
 
 import asyncio
 import gc
@@ -16,16 +16,16 @@ from benchmarks.balancing import (
     sums,
 )
 from benchmarks.blocks import watch
-from benchmarks.ews_boxes import asked, buses_of, dialling, ews_boxes, touch
-from benchmarks.ews_events import Happened, delays, told_by
+from benchmarks.ews_boxes import buses_of, commands, dialling, ews_boxes, operate
+from benchmarks.ews_events import Occurrence, delays, reported_by
 from benchmarks.ews_listener import _Window, period_figures
 from benchmarks.ews_poll import IDEAL, RC, polls
 from benchmarks.figures import Figure, gaps, percentile, results, table
 from benchmarks.offers import Offer
+from benchmarks.oracle import LoggedFrame, _log
 from benchmarks.responder import _answer
 from benchmarks.set_points import Called, offered_after
 from benchmarks.set_value import _seen
-from benchmarks.witness import Heard, _log
 from custom_components.evse_bus.evse.modbus import AsciiFramer
 from tests.virtual import VirtualBus
 from tests.virtual.ews_frames import INFO, command, frame
@@ -47,7 +47,7 @@ def test_percentile_is_nearest_rank() -> None:
 
 
 @given(st.lists(st.floats(0, 1e6), min_size=1), st.floats(0.001, 1.0))
-def test_percentile_is_not_exceeded_by_its_share(
+def test_a_share_of_the_values_does_not_exceed_the_percentile(
     values: list[float], share: float
 ) -> None:
     found = percentile(values, share)
@@ -68,9 +68,9 @@ def test_gaps() -> None:
 def test_aims() -> None:
     assert MEASURED.met is False
     assert MEASURED.shown_aim == "<= 252.0 NO"
-    told = Figure(benchmark="scan", name="mean", value=1.0)
-    assert told.met is None
-    assert told.shown_aim == ""
+    without = Figure(benchmark="scan", name="mean", value=1.0)
+    assert without.met is None
+    assert without.shown_aim == ""
     assert Figure(benchmark="a", name="b", value=0, aim=0).met is True
 
 
@@ -90,7 +90,7 @@ def test_results_can_be_written() -> None:
     assert written["figures"][0]["met"] is False
 
 
-def test_responder_answers_with_good_frames() -> None:
+def test_responder_replies_with_good_frames() -> None:
     framer = AsciiFramer()
     (frame,) = framer.feed(_answer(1, "2EA1106403E803E803E8"))
     assert (frame.unit, frame.is_reply, framer.bad) == (1, True, 0)
@@ -101,13 +101,13 @@ def test_call_is_found_in_the_log() -> None:
     read, write = b":0103002E0005C9\r\n", b":010E0014\r\n"
     limit = b":01100014000102010AC5\r\n"
     log = [
-        Heard(1.0, 1.1, from_client=True, data=b":0203002E0005C8\r\n"),
-        Heard(1.2, 1.3, from_client=False, data=b">02"),
-        Heard(1.4, 1.5, from_client=True, data=read),
-        Heard(1.6, 1.7, from_client=False, data=b">01"),
-        Heard(1.8, 1.9, from_client=True, data=limit),
-        Heard(2.0, 2.1, from_client=False, data=b">01"),
-        Heard(2.2, 2.3, from_client=True, data=write),
+        LoggedFrame(1.0, 1.1, from_client=True, data=b":0203002E0005C8\r\n"),
+        LoggedFrame(1.2, 1.3, from_client=False, data=b">02"),
+        LoggedFrame(1.4, 1.5, from_client=True, data=read),
+        LoggedFrame(1.6, 1.7, from_client=False, data=b">01"),
+        LoggedFrame(1.8, 1.9, from_client=True, data=limit),
+        LoggedFrame(2.0, 2.1, from_client=False, data=b">01"),
+        LoggedFrame(2.2, 2.3, from_client=True, data=write),
     ]
     call = _seen(log, 1, 1.25, 2.15, raises=True)
     assert call.turn == pytest.approx(0.15)
@@ -122,9 +122,11 @@ BROADCAST = "001000010004080064003c00000000ff7a"
 """As recorded."""
 
 
-def _heard(start: float, data: str, *, by_us: bool = True, hit: bool = False) -> Heard:
+def _heard(
+    start: float, data: str, *, by_us: bool = True, hit: bool = False
+) -> LoggedFrame:
     raw = bytes.fromhex(data)
-    return Heard(start, start + 0.01, from_client=by_us, data=raw, collided=hit)
+    return LoggedFrame(start, start + 0.01, from_client=by_us, data=raw, collided=hit)
 
 
 def test_broadcasts_are_found_in_the_log() -> None:
@@ -141,7 +143,7 @@ def test_broadcasts_are_found_in_the_log() -> None:
     assert longest_silence([], 7.0) == 0.0
 
 
-def test_what_is_due_is_told_from_what_comes_between() -> None:
+def test_due_broadcasts_are_separated_from_those_between() -> None:
     times = [9.9, 10.01, 11.0, 12.0, 12.1, 14.5, 15.0, 19.0]
     # At 16 there was none, and the next one is late for 16 and for 18.
     assert on_plan(times, 10.0) == [
@@ -154,11 +156,11 @@ def test_what_is_due_is_told_from_what_comes_between() -> None:
     assert on_plan([], 10.0) == []
 
 
-def test_requests_and_their_answers_are_found() -> None:
+def test_requests_and_their_replies_are_found() -> None:
     asks, granted = "020600020082a858", "02060082003c29c0"
     log = [
         _heard(1.0, asks, by_us=False),
-        # What another box owed us is said first; then the bus is idle.
+        # The pending reply of another box comes first; then the bus is idle.
         _heard(1.016, "010400a00009302e", by_us=False),
         _heard(1.036, granted),
         _heard(5.0, asks, by_us=False, hit=True),
@@ -171,9 +173,9 @@ def test_requests_and_their_answers_are_found() -> None:
     assert (first.unit, first.register, first.garbled) == (2, 2, False)
     assert first.end == pytest.approx(1.01)
     assert first.idle == pytest.approx(1.026)
-    assert first.answered == 1.036
-    assert (second.answered, second.garbled) == (None, True)
-    assert (third.idle, third.answered) == (pytest.approx(6.01), 6.7)
+    assert first.replied == 1.036
+    assert (second.replied, second.garbled) == (None, True)
+    assert (third.idle, third.replied) == (pytest.approx(6.01), 6.7)
 
 
 def _offer(at: float, name: str, amps: float, *, closed: bool = True) -> Offer:
@@ -213,7 +215,7 @@ def test_a_lowered_supply_is_no_violation_but_takes_time() -> None:
     found = sums(offers, shared, 10.0)
     assert (found.most, found.violations) == (26.0, 0)
     assert found.longest == pytest.approx(0.5)
-    # One goes up although the sum is too much already; and it stays so.
+    # One goes up although the sum is too high already; and it stays so.
     worse = [*offers[:4], _offer(5.2, "b", 11.0)]
     found = sums(worse, shared, 10.0)
     assert (found.violations, found.longest) == (1, pytest.approx(5.0))
@@ -232,10 +234,10 @@ def test_an_offer_after_a_set_point_is_found() -> None:
 
 
 @pytest.mark.real_time
-async def test_blocks_are_timed_and_the_loop_left_as_it_was() -> None:
+async def test_blocks_are_timed_and_the_loop_is_restored() -> None:
     before = asyncio.Handle._run
     with watch() as blocks:
-        # The callback that we are in ends, and another one.
+        # This callback ends, and another one runs.
         await asyncio.sleep(0)
         await asyncio.sleep(0)
     assert asyncio.Handle._run is before
@@ -244,24 +246,24 @@ async def test_blocks_are_timed_and_the_loop_left_as_it_was() -> None:
 
 
 @pytest.mark.real_time
-async def test_garbage_collection_is_told_apart_from_what_a_callback_does() -> None:
-    # Something to go through: more of it than the little that is told of.
-    held = [[n] for n in range(300_000)]
+async def test_garbage_collection_is_listed_apart_from_own_time() -> None:
+    # Many objects, so that a collection takes long enough to be listed.
+    objects = [[n] for n in range(300_000)]
     with watch() as blocks:
         await asyncio.sleep(0)
         gc.collect()
         await asyncio.sleep(0)
-    assert len(held) == 300_000
-    (_, own, what) = max(blocks.longest)
-    assert "ms of it garbage collection" in what
+    assert len(objects) == 300_000
+    (_, own, name) = max(blocks.longest)
+    assert "ms of it garbage collection" in name
     assert blocks.busiest[0] < own / 2
 
 
 # -- EWS-Boxes ---------------------------------------------------------------------
 
 
-def _ews(start: float, data: bytes, *, by_us: bool = True) -> Heard:
-    return Heard(start, start + 0.01, from_client=by_us, data=data)
+def _ews(start: float, data: bytes, *, by_us: bool = True) -> LoggedFrame:
+    return LoggedFrame(start, start + 0.01, from_client=by_us, data=data)
 
 
 def test_polls_of_a_box_are_found_in_the_log() -> None:
@@ -272,33 +274,33 @@ def test_polls_of_a_box_are_found_in_the_log() -> None:
         _ews(3.0, command("rc")),
     ]
     assert polls(log) == [1.0, 3.0]
-    # As the protocol's facts have it.
+    # As in PROTOCOLS.md.
     assert pytest.approx(10.6e-3, abs=0.05e-3) == RC
     assert pytest.approx(20.7e-3, abs=0.05e-3) == IDEAL
 
 
-def test_what_is_seen_belongs_to_what_was_done() -> None:
+def test_a_change_belongs_to_the_last_action_before_it() -> None:
     done = [
-        Happened(1.0, 1, "press_start"),
-        Happened(1.2, 1, "press_end"),
-        # Never seen; the next one of its kind is, and is not taken for it.
-        Happened(2.0, 1, "press_start"),
-        Happened(3.0, 1, "press_start"),
-        Happened(4.0, 2, "press_start"),
+        Occurrence(1.0, 1, "press_start"),
+        Occurrence(1.2, 1, "press_end"),
+        # Without a change; that of the next action of its kind does not count for it.
+        Occurrence(2.0, 1, "press_start"),
+        Occurrence(3.0, 1, "press_start"),
+        Occurrence(4.0, 2, "press_start"),
     ]
     seen = [
-        Happened(0.5, 1, "press_start"),
-        Happened(1.01, 1, "press_start"),
-        Happened(1.22, 1, "press_end"),
-        Happened(3.03, 1, "press_start"),
-        # Another port's, and another kind.
-        Happened(4.01, 1, "press_start"),
-        Happened(4.02, 2, "press_end"),
+        Occurrence(0.5, 1, "press_start"),
+        Occurrence(1.01, 1, "press_start"),
+        Occurrence(1.22, 1, "press_end"),
+        Occurrence(3.03, 1, "press_start"),
+        # Of another port, and of another kind.
+        Occurrence(4.01, 1, "press_start"),
+        Occurrence(4.02, 2, "press_end"),
     ]
     assert delays(done, seen) == pytest.approx([0.01, 0.02, 0.03])
 
 
-def test_the_record_that_tells_it_is_found() -> None:
+def test_the_record_of_an_action_is_found() -> None:
     record = frame(INFO, b"if" + bytes(9))
     log = [
         _ews(0.9, record, by_us=False),
@@ -306,27 +308,29 @@ def test_the_record_that_tells_it_is_found() -> None:
         _ews(1.01, frame(b"A", b"rc" + bytes(108)), by_us=False),
         _ews(1.03, record, by_us=False),
     ]
-    (told,) = told_by(log, [Happened(1.0, 1, "on"), Happened(2.0, 1, "off")])
-    assert told == Happened(pytest.approx(1.04), 1, "on")
+    (reported,) = reported_by(
+        log, [Occurrence(1.0, 1, "on"), Occurrence(2.0, 1, "off")]
+    )
+    assert reported == Occurrence(pytest.approx(1.04), 1, "on")
 
 
-def test_periods_are_those_within_a_while() -> None:
-    asked_of = {
+def test_periods_are_those_within_the_windows() -> None:
+    commands_to = {
         "a": [(at, "rc") for at in (0.0, 2.0, 4.5, 10.0, 12.0)],
         "b": [(1.0, "rc"), (1.1, "rd"), (3.0, "rc"), (11.0, "rc"), (13.5, "rc")],
     }
-    figures = period_figures(asked_of, [_Window(0.0, 5.0), _Window(9.0, 13.0)])
+    figures = period_figures(commands_to, [_Window(0.0, 5.0), _Window(9.0, 13.0)])
     found = {one.name: one.value for one in figures}
     assert found["poll period, mean"] == pytest.approx((2.0 + 2.5 + 2.0 + 2.0) / 4)
     assert found["poll period, longest"] == 2.5
     assert found["poll period, p99 of that box"] == 2.5
 
 
-def test_a_box_is_touched_and_says_what_it_was_asked() -> None:
+def test_a_box_is_operated_and_records_its_commands() -> None:
     boxes = ews_boxes(boxes=[{"serial": "000000000042", "manual_io": True}])
     with VirtualBus.pty(*boxes, ring=None) as bus:
         before = bus.time()
-        at = touch(bus, "ews-000000000042", "key_down", 2, 3)
+        at = operate(bus, "ews-000000000042", "key_down", 2, 3)
         assert before <= at <= bus.time()
         bus.wait_for(lambda: len(bus.log))
         [[start, _, by_us, data, _]] = _log(bus, at)  # type: ignore[misc]
@@ -334,14 +338,14 @@ def test_a_box_is_touched_and_says_what_it_was_asked() -> None:
         # Key 3 of port 2 is pressed.
         assert data[12:30] == "00" + "00" * 6 + "ff" + "00"
         bus.inject(command("rc"), source="client")
-        assert asked(bus, at) == {"ews-000000000042": []}
-        bus.wait_for(lambda: asked(bus, at)["ews-000000000042"])
-        [[heard_at, name]] = asked(bus, at)["ews-000000000042"]
-        assert (heard_at > at, name) == (True, "rc")
-        assert asked(bus, heard_at + 1) == {"ews-000000000042": []}
+        assert commands(bus, at) == {"ews-000000000042": []}
+        bus.wait_for(lambda: commands(bus, at)["ews-000000000042"])
+        [[received_at, name]] = commands(bus, at)["ews-000000000042"]
+        assert (received_at > at, name) == (True, "rc")
+        assert commands(bus, received_at + 1) == {"ews-000000000042": []}
 
 
-def test_many_boxes_are_many_lines() -> None:
+def test_many_boxes_are_many_buses() -> None:
     boxes = ews_boxes(boxes=[{"serial": f"{n:012d}"} for n in (1, 2, 3)])
     fleet = dialling(boxes, "127.0.0.1:4711")
     assert [bus.devices[0].name for bus in buses_of(fleet)] == [

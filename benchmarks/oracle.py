@@ -1,10 +1,9 @@
-"""The virtual bus in a process of its own, and its log as the witness.
+"""Virtual chargers in a process of their own, whose log is the oracle.
 
-As a program: ``python -m benchmarks.witness SPEC`` (JSON) puts virtual chargers on a
-pty (or lets them dial an address), prints its path, and then does what it reads from
-stdin until that ends. As a module: `Witness` starts such a process. Both ends use
-CLOCK_MONOTONIC, which is one clock for the whole machine, so times of the log can be
-compared with ours.
+As a program: ``python -m benchmarks.oracle SPEC`` (JSON) puts virtual chargers on a pty
+(or lets them dial an address), prints its path, and executes commands from stdin until
+that ends. As a module: `Oracle` starts such a process. Both ends use CLOCK_MONOTONIC,
+one clock for the whole machine, so that times of the log can be compared with ours.
 """
 
 import asyncio
@@ -19,12 +18,12 @@ from tests.virtual.device import Device
 
 from .ews_boxes import (
     Buses,
-    asked,
     buses_of,
+    commands,
     dialling,
     ews_boxes,
+    operate,
     plug_in,
-    touch,
 )
 from .machine import ROOT
 from .offers import Offer, offers_of, smartevse_boxes
@@ -36,7 +35,7 @@ _LINE_LIMIT = 2**28
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class LoggedFrame:
     """One frame on the wire; times in seconds of CLOCK_MONOTONIC."""
 
     start: float
@@ -46,11 +45,11 @@ class Heard:
     collided: bool = False
 
 
-class Witness:
-    """A virtual bus in another process."""
+class Oracle:
+    """Virtual chargers in another process."""
 
     def __init__(self, protocol: str, **options: object) -> None:
-        """Say who is on the bus (see `_MAKERS`); ``dial``: HOST:PORT that they dial."""
+        """Prepare these chargers (see `_MAKERS`); ``dial``: HOST:PORT that they dial."""
         self._spec = json.dumps({"protocol": protocol, **options})
         self._process: asyncio.subprocess.Process | None = None
         self.url = ""
@@ -60,7 +59,7 @@ class Witness:
         self._process = await asyncio.create_subprocess_exec(
             sys.executable,
             "-m",
-            "benchmarks.witness",
+            "benchmarks.oracle",
             self._spec,
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.PIPE,
@@ -68,7 +67,7 @@ class Witness:
             limit=_LINE_LIMIT,
         )
         async with asyncio.timeout(_READY_WITHIN):
-            self.url = str(await self._answer())
+            self.url = str(await self._result())
         return self
 
     async def __aexit__(self, *_error: object) -> None:
@@ -84,65 +83,65 @@ class Witness:
             process.kill()
             await process.wait()
 
-    async def log(self, since: float = 0.0) -> list[Heard]:
-        """Return what was on the wire from then on, frame by frame."""
-        entries: Any = await self._ask({"log": since})
+    async def log(self, since: float = 0.0) -> list[LoggedFrame]:
+        """Return the frames on the wire from a time on."""
+        entries: Any = await self._command({"log": since})
         return [
-            Heard(start, end, from_client, bytes.fromhex(data), collided)
+            LoggedFrame(start, end, from_client, bytes.fromhex(data), collided)
             for start, end, from_client, data, collided in entries
         ]
 
     async def offers(self) -> list[Offer]:
-        """Return what SmartEVSEs have offered, change by change."""
-        entries: Any = await self._ask({"offers": True})
+        """Return the changes of the offers of SmartEVSEs."""
+        entries: Any = await self._command({"offers": True})
         return [Offer(*entry) for entry in entries]
 
     async def stats(self) -> dict[str, Any]:
-        """Return the virtual chargers' own counters."""
-        answer: dict[str, Any] = await self._ask({"stats": True})
-        return answer
+        """Return the counters of the virtual chargers."""
+        stats: dict[str, Any] = await self._command({"stats": True})
+        return stats
 
     async def kill(self, names: Sequence[str]) -> None:
-        """Let these devices fall silent."""
-        await self._ask({"kill": list(names)})
+        """Make these devices dead."""
+        await self._command({"kill": list(names)})
 
-    async def touch(self, name: str, what: str, port: int, *values: int) -> float:
-        """Do something to an EWS-Box (see `ews_boxes.touch`); return when."""
-        return float(await self._ask({"touch": [name, what, port, *values]}))
+    async def operate(self, name: str, action: str, port: int, *values: int) -> float:
+        """Operate an EWS-Box (see `ews_boxes.operate`); return the time, s."""
+        return float(await self._command({"operate": [name, action, port, *values]}))
 
-    async def asked(self, since: float) -> dict[str, list[tuple[float, str]]]:
-        """Return what each EWS-Box has been asked from then on, and when."""
-        entries: dict[str, Any] = await self._ask({"asked": since})
-        return {name: [(at, what) for at, what in one] for name, one in entries.items()}
+    async def commands(self, since: float) -> dict[str, list[tuple[float, str]]]:
+        """Return times and names of the commands to each EWS-Box from a time on."""
+        entries: dict[str, Any] = await self._command({"commands": since})
+        return {box: [(at, name) for at, name in one] for box, one in entries.items()}
 
     async def plug_in(self) -> None:
-        """Let a car come to each port of all EWS-Boxes."""
-        await self._ask({"plug_in": True})
+        """Plug a car in at each port of all EWS-Boxes."""
+        await self._command({"plug_in": True})
 
     async def unplug(self) -> None:
         """Pull the adapter, or all network cables."""
-        await self._ask({"unplug": True})
+        await self._command({"unplug": True})
 
     async def replug(self) -> None:
-        """Put it, or all of them, back."""
-        await self._ask({"replug": True})
+        """Plug it, or all of them, in again."""
+        await self._command({"replug": True})
 
-    async def _ask(self, command: dict[str, object]) -> Any:  # noqa: ANN401 - JSON
+    async def _command(self, command: dict[str, object]) -> Any:  # noqa: ANN401 - JSON
         process = self._process
         if process is None or process.stdin is None:
-            message = "the virtual bus is not running"
+            message = "the virtual chargers are not running"
             raise RuntimeError(message)
         process.stdin.write(json.dumps(command).encode() + b"\n")
         await process.stdin.drain()
-        return await self._answer()
+        return await self._result()
 
-    async def _answer(self) -> Any:  # noqa: ANN401 - JSON
+    async def _result(self) -> Any:  # noqa: ANN401 - JSON
         if self._process is None or self._process.stdout is None:
-            message = "the virtual bus is not running"
+            message = "the virtual chargers are not running"
             raise RuntimeError(message)
         line = await self._process.stdout.readline()
         if not line:
-            message = "the virtual bus has ended by itself"
+            message = "the virtual chargers have ended by themselves"
             raise RuntimeError(message)
         return json.loads(line)
 
@@ -153,7 +152,7 @@ class Witness:
 def _abl(
     *, ids: Sequence[int], dead: Sequence[int] = (), plugged: bool = False
 ) -> list[Device]:
-    """Make wallboxes that answer 2 ms after a request, without jitter."""
+    """Make wallboxes that reply 2 ms after a request, without jitter."""
     boxes: list[Device] = []
     for number in ids:
         car = Car()
@@ -166,7 +165,7 @@ def _abl(
 
 
 def _evbox(*, serials: Sequence[int], modules: int) -> list[Device]:
-    """Make ChargePoints of so many modules, a car charging at each."""
+    """Make ChargePoints of so many modules, with a car charging at each."""
     points: list[Device] = []
     for serial in serials:
         cars = [Car(phases=1 + at % 3) for at in range(modules)]
@@ -199,7 +198,7 @@ def _offers(bus: Buses) -> object:
 
 
 def _log(bus: Buses, since: float) -> object:
-    heard = [
+    entries = [
         entry
         for one in buses_of(bus)
         for entry in (
@@ -207,7 +206,7 @@ def _log(bus: Buses, since: float) -> object:
             *(each for each in one.log if each.source != CLIENT),
         )
     ]
-    heard.sort(key=lambda entry: entry.t)
+    entries.sort(key=lambda entry: entry.t)
     return [
         (
             entry.t,
@@ -216,20 +215,20 @@ def _log(bus: Buses, since: float) -> object:
             entry.data.hex(),
             entry.collided,
         )
-        for entry in heard
+        for entry in entries
         if entry.t >= since
     ]
 
 
 _COMMANDS: Final[dict[str, Callable[[Buses, Any], object]]] = {
-    "asked": asked,
+    "commands": commands,
     "kill": _kill,
     "log": _log,
     "offers": lambda bus, _: _offers(bus),
     "plug_in": lambda bus, _: plug_in(bus),
     "replug": lambda bus, _: bus.replug(),
     "stats": lambda bus, _: bus.stats(),
-    "touch": lambda bus, how: touch(bus, *how),
+    "operate": lambda bus, action: operate(bus, *action),
     "unplug": lambda bus, _: bus.unplug(),
 }
 
@@ -242,8 +241,8 @@ def _main() -> None:
     with one as bus:
         print(json.dumps(bus.url), flush=True)
         for line in sys.stdin:
-            ((command, about),) = json.loads(line).items()
-            print(json.dumps(_COMMANDS[command](bus, about)), flush=True)
+            ((command, argument),) = json.loads(line).items()
+            print(json.dumps(_COMMANDS[command](bus, argument)), flush=True)
 
 
 if __name__ == "__main__":

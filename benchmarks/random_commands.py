@@ -1,4 +1,4 @@
-"""What a house asks of its chargers, at random moments."""
+"""Commands to chargers at random moments."""
 
 import asyncio
 from collections.abc import Sequence
@@ -14,10 +14,10 @@ from custom_components.evse_bus.evse.model import Circuit, OrderChange
 from .balancing import Shared
 
 SUPPLIES: Final = (12.0, 16.0, 20.0, 25.0, 32.0)
-"""A; each leaves the least for two boxes."""
+"""A; each is enough for the minimum of two boxes."""
 CURRENTS: Final = (6.0, 8.0, 10.0, 12.5, 14.0, 16.0)
 FORBIDS: Final = 0.1
-"""Share of commands that forbid a charger to charge; the next one allows it again."""
+"""Share of commands that pause a charger; the next one allows it to charge again."""
 SHARES: Final = 0.3
 """Share of commands that change the supply."""
 PAUSES: Final = (0.2, 2.0)
@@ -25,20 +25,20 @@ PAUSES: Final = (0.2, 2.0)
 
 
 @dataclass(slots=True)
-class House:
-    """Sets currents, allows and forbids, and shares less or more, until told to end."""
+class RandomCommands:
+    """Sets currents, pauses and allows chargers, and changes the shared supply."""
 
     bus: Bus
     chargers: Sequence[Charger]
     shared: list[Shared]
-    """What the chargers shared, from when on."""
+    """The supplies that were shared, by time."""
     dice: Random
     given: int = 0
     refused: list[str] = field(default_factory=list)
-    """Commands that were not obeyed, and why."""
+    """The errors of commands that failed."""
 
-    async def live(self, seconds: float) -> None:
-        """Give commands for so long."""
+    async def run(self, seconds: float) -> None:
+        """Give commands for this time (s)."""
         loop = asyncio.get_running_loop()
         end = loop.time() + seconds
         while (left := end - loop.time()) > 0:
@@ -64,7 +64,7 @@ class House:
         await charger.change_orders(change)
 
     async def share(self, amps: float) -> None:
-        """Let the chargers share so much."""
+        """Change the shared supply (A)."""
         master = self.bus.master
         if master is not None:
             self.shared.append(Shared(asyncio.get_running_loop().time(), amps))
