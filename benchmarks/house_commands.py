@@ -45,7 +45,7 @@ async def add_entry(
         ConfigSubentryData,
     )
 
-    from custom_components.evse_bus.configuration import charger_unique_id  # noqa: PLC0415
+    from custom_components.evse_bus.evse.protocols import PROTOCOLS  # noqa: PLC0415
 
     entry = ConfigEntry(
         data={"protocol": protocol, **address},
@@ -59,7 +59,7 @@ async def add_entry(
                 data={"voltage": 230.0, "order_lifetime": None, **charger},
                 subentry_type="charger",
                 title=f"{protocol} {charger['address']}",
-                unique_id=charger_unique_id(protocol, charger["serial"]),
+                unique_id=PROTOCOLS[protocol].unique_id(charger["serial"]),
             )
             for charger in chargers
         ],

@@ -4,6 +4,7 @@ import asyncio
 import gc
 import json
 
+from homeassistant.core import HomeAssistant
 from hypothesis import given, strategies as st
 import pytest
 
@@ -21,6 +22,8 @@ from benchmarks.ews_events import Occurrence, delays, reported_by
 from benchmarks.ews_listener import _Window, period_figures
 from benchmarks.ews_poll import IDEAL, RC, polls
 from benchmarks.figures import Figure, gaps, percentile, results, table
+from benchmarks.house_boxes import box_entry
+from benchmarks.house_commands import add_entry
 from benchmarks.offers import Offer
 from benchmarks.oracle import LoggedFrame, _log
 from benchmarks.responder import _answer
@@ -343,6 +346,16 @@ def test_a_box_is_operated_and_records_its_commands() -> None:
         [[received_at, name]] = commands(bus, at)["ews-000000000042"]
         assert (received_at > at, name) == (True, "rc")
         assert commands(bus, received_at + 1) == {"ews-000000000042": []}
+
+
+@pytest.mark.usefixtures("not_set_up")
+async def test_entries_are_those_of_the_config_flow(hass: HomeAssistant) -> None:
+    serial = "000000000042"
+    address = {"host": "127.0.0.1", "port": 4712}
+    entry = await add_entry(hass, **box_entry([serial], interval=2.0, **address))
+    assert entry.data == {"protocol": "ews_network", **address}
+    (subentry,) = entry.subentries.values()
+    assert subentry.unique_id == f"ews_{serial}"
 
 
 def test_many_boxes_are_many_buses() -> None:
