@@ -1,5 +1,5 @@
-"""The demo: virtual buses and a real Home Assistant that knows them.
+"""The demo: virtual buses, and a real Home Assistant with all of them set up.
 
-Started by ``scripts/demo``; `__main__` tells the story. Everything it makes is in
-one folder, and nothing of it is needed by the integration.
+Started by ``scripts/demo``; begin to read at `__main__`. Everything it creates is in one
+folder, and the integration needs nothing of it.
 """

@@ -22,11 +22,11 @@ BUS_PATIENCE: Final = 15.0
 START_PATIENCE: Final = 600.0
 """Seconds; a first start on a slow machine compiles much."""
 RESTART: Final = 100
-"""Home Assistant's exit code when somebody has asked for a restart."""
+"""Home Assistant's exit code for a restart."""
 
 
 def main() -> int:
-    """Run until a signal, or until something ends that should not."""
+    """Run until a signal, or until a program ends that should not."""
     try:
         settings = from_environment()
         with alone(settings):
@@ -45,7 +45,7 @@ def main() -> int:
 
 @contextmanager
 def alone(settings: Settings) -> Iterator[None]:
-    """Keep a second demo out of the same folder."""
+    """Hold the lock of the folder: one demo at a time. Raises DemoError."""
     settings.folder.mkdir(parents=True, exist_ok=True)
     with (settings.folder / "lock").open("w") as lock:
         try:
@@ -56,8 +56,8 @@ def alone(settings: Settings) -> Iterator[None]:
         here = str(settings.folder)
         if place.exists() and place.read_text(encoding="utf-8") != here:
             raise DemoError(
-                f"{here} was made in another place, and its ports are there;"
-                " remove it to begin anew"
+                f"{here} was created in another place, and its ports are there;"
+                " remove it to start again"
             )
         place.write_text(here, encoding="utf-8")
         yield
@@ -69,7 +69,7 @@ async def _until_signal(settings: Settings) -> None:
     demo = asyncio.create_task(_run(settings, programs))
 
     def stop() -> None:
-        # Once: a second, impatient Ctrl-C is not to interrupt the cleaning up.
+        # Once: a second Ctrl-C must not interrupt the cleanup.
         if not demo.done() and not demo.cancelling():
             demo.cancel()
 
@@ -81,7 +81,7 @@ async def _until_signal(settings: Settings) -> None:
     finally:
         if any(program.running for program in programs):
             say("stopping ...")
-        # Home Assistant first: its chargers are not to vanish before it.
+        # Home Assistant first: its chargers must not disappear before it.
         for program in reversed(programs):
             await program.stop()
         say("stopped")
@@ -113,9 +113,9 @@ async def _run(settings: Settings, programs: list[Program]) -> None:
             other.cancel()
         if [waits[one] for one in ended] != [home] or await home.wait() != RESTART:
             program = waits[ended.pop()]
-            raise DemoError(f"{program.name} has ended:\n{program.last_words()}")
+            raise DemoError(f"{program.name} has ended:\n{program.log_tail()}")
         programs.remove(home)
-        say("Home Assistant was asked to restart")
+        say("Home Assistant restarts")
 
 
 async def _start_bus(settings: Settings, bus: DemoBus) -> Program:
@@ -141,7 +141,7 @@ async def _bus_ready(program: Program, bus: DemoBus) -> None:
                 return
     except TimeoutError:
         pass
-    raise DemoError(f"{bus.title} does not start:\n{program.last_words()}")
+    raise DemoError(f"{bus.title} does not start:\n{program.log_tail()}")
 
 
 async def _start_home(settings: Settings) -> Program:
@@ -161,9 +161,9 @@ async def _wait_until_running(client: Client, home: Program) -> None:
             if running:
                 return
             if not home.running:
-                raise DemoError(f"Home Assistant has ended:\n{home.last_words()}")
+                raise DemoError(f"Home Assistant has ended:\n{home.log_tail()}")
             if progress.seconds > START_PATIENCE:
-                raise DemoError(f"Home Assistant hangs:\n{home.last_words()}")
+                raise DemoError(f"Home Assistant hangs:\n{home.log_tail()}")
             progress.show(f"{components} components" if components else "")
             await asyncio.sleep(GLANCE)
 
@@ -173,7 +173,7 @@ def _welcome(settings: Settings) -> None:
     say(f"Home Assistant is ready:  {settings.url}")
     say(f"  user {USER}, password {PASSWORD}; the dashboard is called Chargers")
     say(f"  a long-lived token is in {settings.token}")
-    say(f"  what it logs is in {settings.log}")
+    say(f"  its log is {settings.log}")
     say("Ctrl-C stops everything.")
 
 

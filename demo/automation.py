@@ -1,7 +1,7 @@
 """The automation that lets cars charge at the EWS-Boxes. Pure.
 
-In its server mode such a box starts no charge by itself: a driver presses start, and
-waits until Home Assistant allows it.
+In server mode such a box starts no charge by itself: a driver presses start, and waits
+until Home Assistant allows it.
 """
 
 from collections.abc import Iterable
@@ -14,13 +14,13 @@ AUTOMATION_ID: Final = "evse_bus_demo_start_requests"
 
 
 def answer_start_requests(buses: Iterable[ListedBus]) -> dict[str, Any] | None:
-    """Return an automation that answers yes, at each port; ``None``: there is none."""
+    """Return an automation that allows each request; ``None``: there are no ports."""
     ports = [
-        (asked, allow)
+        (requested, allow)
         for bus in buses
         for charger in bus.chargers
         for port in charger.connectors.values()
-        if (asked := port.find("start_requested"))
+        if (requested := port.find("start_requested"))
         and (allow := port.find("charging_allowed"))
     ]
     if not ports:
@@ -28,12 +28,12 @@ def answer_start_requests(buses: Iterable[ListedBus]) -> dict[str, Any] | None:
     return {
         "alias": "Answer start requests",
         "description": (
-            "Whoever presses start at an EWS-Box may charge. The trigger's ID is the"
+            "Allow charging when start is pressed at an EWS-Box. The trigger's ID is the"
             " switch of the same port."
         ),
         "triggers": [
-            {"trigger": "state", "entity_id": asked, "to": "on", "id": allow}
-            for asked, allow in ports
+            {"trigger": "state", "entity_id": requested, "to": "on", "id": allow}
+            for requested, allow in ports
         ],
         "conditions": [],
         "actions": [

@@ -1,4 +1,4 @@
-"""The buses of the demo: what is on them, and how a person would add them."""
+"""The buses of the demo: their chargers, and the steps of the config flow."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -7,7 +7,7 @@ from typing import Any, Final
 from .settings import HOST, Settings
 
 type Answer = Mapping[str, Any] | Callable[[Mapping[str, Any]], Mapping[str, Any]]
-"""What to fill into a step, or how to tell from what the step shows."""
+"""The values for a step, or a function that makes them from the step."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -15,18 +15,18 @@ class DemoBus:
     """One virtual bus and its chargers."""
 
     protocol: str
-    """Key of the integration's; names the port and the log as well."""
+    """Key of the protocol; also in the names of port and log."""
     title: str
     virtual: tuple[str, ...]
-    """Arguments of scripts/virtual-chargers, but for the line."""
+    """Arguments of scripts/virtual-chargers, without the line."""
     dials: bool = False
     """Its boxes dial Home Assistant; there is no port, and nothing to search."""
     names: Mapping[str, str]
     """Name of a charger by its address, as the config flow shows it."""
     currents: Mapping[str, float]
-    """Charging current to begin with by name, A; that of each port where it has some."""
+    """First charging current by name, A; of each port of a box with ports."""
     limits: Mapping[str, float] = field(default_factory=dict)
-    """Installation limits as each charger's form has them, where not suggested."""
+    """Installation limits in the form of each charger, where not suggested."""
     connectors: int
     choose: Mapping[str, Answer]
     """Steps of the config flow up to the port."""
@@ -35,7 +35,7 @@ class DemoBus:
 
     @property
     def ready(self) -> str:
-        """Return what the virtual chargers say when the port is there."""
+        """Return the output of the virtual chargers once the port exists."""
         return f"ready {self.virtual[0]} "
 
     def arguments(self, settings: Settings) -> tuple[str, ...]:
@@ -45,7 +45,7 @@ class DemoBus:
         return (*self.virtual, "--pty", str(settings.link(self.protocol)))
 
     def answers(self, settings: Settings) -> dict[str, Answer]:
-        """Return what to answer in the config flow, and when a box has dialled."""
+        """Return the values for the steps of the config flow, and of discovered boxes."""
         listen = {"host": HOST, "port": settings.listen_port}
         line: dict[str, Answer] = (
             {"listen": listen, "discovered": {}}
@@ -69,7 +69,7 @@ class DemoBus:
 
 _LIFE: Final = (
     *("--cars", "auto"),
-    # Little batteries, so that there is something to see every minute.
+    # Small batteries, so that there is a change every minute.
     *("--away", "10", "60", "--wants", "50", "400"),
 )
 
@@ -137,7 +137,7 @@ BUSES: Final = (
             "mode": {"next_step_id": "master"},
         },
         search={
-            # Less than both could use: one car more or less can be seen.
+            # Less than both could use, so that one car more or less shows.
             "supply": {"supply_limit": 25, "supply_minimum": 6},
             "select": {"installation_limit": 16},
         },

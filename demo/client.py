@@ -1,4 +1,4 @@
-"""A client of Home Assistant's REST and websocket API, as the frontend is one."""
+"""A client of Home Assistant's REST and websocket API, as the frontend is."""
 
 from collections.abc import Mapping
 from http import HTTPStatus
@@ -11,7 +11,7 @@ from .settings import DemoError
 
 
 class Client:
-    """Speaks to one Home Assistant; use with `async with`."""
+    """A client of one Home Assistant; use with `async with`."""
 
     def __init__(self, url: str, token: str) -> None:
         """Prepare; nothing is sent yet."""
@@ -34,13 +34,13 @@ class Client:
         await self._session.close()
 
     async def running(self) -> tuple[bool, int]:
-        """Return whether everything is set up, and how many components are so far."""
+        """Return whether everything is set up, and the number of components so far."""
         try:
             async with self._session.get(f"{self._url}/api/config") as answer:
                 if answer.status == HTTPStatus.UNAUTHORIZED:
                     raise DemoError(
-                        "Home Assistant does not know the token any more; remove the"
-                        " demo's folder to begin anew"
+                        "Home Assistant no longer accepts the token; remove the demo's"
+                        " folder to start again"
                     )
                 if answer.status != HTTPStatus.OK:
                     return False, 0
@@ -51,15 +51,15 @@ class Client:
         return config["state"] == "RUNNING", len(components)
 
     async def get(self, path: str) -> Any:  # noqa: ANN401 - as the API answers
-        """Return what GET answers; raises DemoError."""
+        """Return the result of GET; raises DemoError."""
         return await self._request("GET", path)
 
     async def post(self, path: str, data: Mapping[str, Any]) -> Any:  # noqa: ANN401
-        """Return what POST answers; raises DemoError."""
+        """Return the result of POST; raises DemoError."""
         return await self._request("POST", path, data)
 
     async def delete(self, path: str) -> Any:  # noqa: ANN401
-        """Return what DELETE answers; raises DemoError."""
+        """Return the result of DELETE; raises DemoError."""
         return await self._request("DELETE", path)
 
     async def _request(

@@ -1,4 +1,4 @@
-"""The dashboard "Chargers", built of the entities that are there. Pure."""
+"""The dashboard "Chargers", built from the entities that exist. Pure."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any, Final
@@ -11,7 +11,7 @@ ICON: Final = "mdi:ev-station"
 BUS_ICON: Final = "mdi:source-branch"
 PLUG_ICON: Final = "mdi:ev-plug-type2"
 POWER: Final = ("power", "estimated_power")
-"""Keys of what a connector uses, measured or estimated."""
+"""Keys of the power of a connector, measured or estimated."""
 
 FULL: Final = 12
 HALF: Final = 6
@@ -22,9 +22,9 @@ type Card = dict[str, Any]
 
 
 def dashboard(buses: Iterable[ListedBus]) -> dict[str, Any]:
-    """Return a dashboard: a section for each charger, and what has happened.
+    """Return a dashboard: a section for each charger, and one with the history.
 
-    Chargers that share what there is have one section with that.
+    Chargers with a shared supply have one section together.
     """
     buses = list(buses)
     chargers = [charger for bus in buses for charger in bus.chargers]
@@ -123,7 +123,7 @@ def _control_cards(part: Part) -> list[Card | None]:
 
 
 def _measured(charger: ListedCharger) -> bool:
-    """Return whether it tells what it uses; a SmartEVSE tells what it offers."""
+    """Return whether it reports power; a SmartEVSE reports its offer only."""
     return any(
         connector.find(*POWER) is not None for connector in charger.connectors.values()
     )
@@ -131,7 +131,7 @@ def _measured(charger: ListedCharger) -> bool:
 
 def _connector_cards(connector: Part) -> list[Card | None]:
     return [
-        # An EVBox module does not tell its status, but whether current flows.
+        # An EVBox module reports no status, but whether current flows.
         _tile(
             connector.find("status", "charging"),
             FULL,
@@ -165,7 +165,7 @@ def _connector_cards(connector: Part) -> list[Card | None]:
 
 
 def _used(connector: Part) -> list[Card | None]:
-    """Return what a car uses: in a row where there are currents as well."""
+    """Return the power of a connector, in a row with its currents if it has some."""
     power = connector.find(*POWER)
     name = "Power" if "power" in connector.entities else "Est. power"
     phases = [

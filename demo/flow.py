@@ -1,4 +1,4 @@
-"""A person at a config flow: looks at each step and fills it in."""
+"""Going through a config flow, step by step."""
 
 import asyncio
 from collections.abc import Callable, Iterable, Mapping
@@ -11,11 +11,11 @@ from .settings import DemoError
 
 FLOWS: Final = "config/config_entries/flow"
 GLANCE: Final = 0.2
-"""Seconds between two looks at a step that takes a while."""
+"""Seconds between two reads of a step that takes a while."""
 
 
 def fill(fields: Iterable[Mapping[str, Any]], values: Mapping[str, Any]) -> Any:  # noqa: ANN401
-    """Return a form as somebody leaves it who changes only those values.
+    """Return the input for a form in which only these values are changed.
 
     ``fields``: as Home Assistant sends a form to its frontend. A field without a
     suggestion, a default or a value stays empty.
@@ -41,16 +41,16 @@ async def add_entry(
     answers: Mapping[str, Answer],
     waiting: Callable[[str], None],
 ) -> bool:
-    """Go through a config flow; return whether it was not there already.
+    """Go through a config flow; return whether it created an entry.
 
-    ``waiting`` is told which step takes a while. Raises DemoError.
+    ``waiting`` is called with the name of a step that takes a while. Raises DemoError.
     """
     step = await client.post(FLOWS, {"handler": domain})
     return await _to_the_end(client, step, answers, waiting, "already_configured")
 
 
 async def find_offer(client: Client, domain: str, unique_id: str) -> str | None:
-    """Return the flow of something that was discovered, once it is offered."""
+    """Return the id of the discovery flow of a box, once it is offered."""
     flows = await client.command("config_entries/flow/progress")
     return next(
         (
@@ -81,17 +81,17 @@ async def _to_the_end(
     waiting: Callable[[str], None],
     good_end: str,
 ) -> bool:
-    """Go on from a step; return whether it made an entry, or ended as it may."""
+    """Go on from a step; return whether it created an entry; raises DemoError."""
     flow = f"{FLOWS}/{step['flow_id']}"
     while step["type"] != "create_entry":
         if step["type"] == "abort":
             if step["reason"] == good_end:
                 return False
-            raise DemoError(f"The config flow gave up: {step['reason']}")
+            raise DemoError(f"The config flow was aborted: {step['reason']}")
         try:
             step = await _next(client, flow, step, answers, waiting)
         except BaseException:
-            # A flow left open would be found by the next person.
+            # A flow left open would show in the frontend.
             with suppress(DemoError):
                 await client.delete(flow)
             raise
@@ -113,7 +113,7 @@ async def _next(
     if step.get("errors"):
         raise DemoError(f"The config flow refused step {name}: {step['errors']}")
     if name not in answers:
-        raise DemoError(f"The config flow came to step {name}, which has no answer")
+        raise DemoError(f"The config flow came to step {name}, which has no values")
     answer = answers[name]
     typed = answer(step) if callable(answer) else answer
     if step["type"] == "form":

@@ -1,4 +1,4 @@
-"""Makes a fresh Home Assistant the demo's: buses, limits, automation, dashboard."""
+"""Set-up of a new Home Assistant: buses, limits, automation, dashboard."""
 
 import asyncio
 from collections.abc import Mapping
@@ -15,9 +15,9 @@ from .say import Progress, say
 from .settings import DemoError, Settings
 
 PATIENCE: Final = 60.0
-"""Seconds that all chargers get to show all their connectors."""
+"""Longest wait until all chargers show all their connectors, s."""
 BOX_PATIENCE: Final = 20.0
-"""Seconds that a box gets to dial."""
+"""Longest wait until a box dials, s."""
 GLANCE: Final = 0.5
 
 
@@ -35,11 +35,11 @@ async def furnish(client: Client, settings: Settings) -> None:
 
 
 async def _add_bus(client: Client, settings: Settings, bus: DemoBus) -> bool:
-    """Return whether anything of it was missing."""
+    """Add a bus; return whether any part of it was missing."""
     answers = bus.answers(settings)
     with Progress(f"{bus.title}: config flow") as progress:
         new = await add_entry(client, DOMAIN, answers, progress.show)
-        progress.outcome = "gone through" if new else "knows this bus already"
+        progress.outcome = "completed" if new else "this bus is set up already"
     if bus.dials:
         for serial in bus.names:
             new |= await _add_box(client, bus, serial, answers)
@@ -53,12 +53,12 @@ async def _add_box(
     unique_id = f"ews_{serial}"
     with Progress(f"{bus.names[serial]}: discovered") as progress:
         if unique_id in await _chargers(client):
-            progress.outcome = "knows this box already"
+            progress.outcome = "this box is set up already"
             return False
         while (flow := await find_offer(client, DOMAIN, unique_id)) is None:
             if progress.seconds > BOX_PATIENCE:
-                # Somebody may have ignored it.
-                progress.outcome = "it is not offered"
+                # The discovery may have been ignored.
+                progress.outcome = "not offered"
                 return False
             progress.show("waiting until it dials")
             await asyncio.sleep(GLANCE)
@@ -86,9 +86,9 @@ async def _listed(client: Client) -> list[ListedBus]:
 
 
 async def _all_listed(client: Client) -> list[ListedBus]:
-    """Wait for the chargers' first answers, which tell how many connectors they have."""
+    """Wait for the first replies of the chargers, with their number of connectors."""
     expected = sum(bus.connectors for bus in BUSES)
-    with Progress("Chargers: waiting for their first answers") as progress:
+    with Progress("Chargers: waiting for their first replies") as progress:
         while True:
             buses = await _listed(client)
             listed = sum(
@@ -100,7 +100,7 @@ async def _all_listed(client: Client) -> list[ListedBus]:
             if listed >= expected:
                 return buses
             if progress.seconds > PATIENCE:
-                say(f"only {listed} of {expected} connectors have answered")
+                say(f"only {listed} of {expected} connectors have reported")
                 return buses
             progress.show(f"{listed} of {expected} connectors")
             await asyncio.sleep(GLANCE)
@@ -119,7 +119,7 @@ async def _first_limits(client: Client, bus: DemoBus, buses: list[ListedBus]) ->
 
 
 async def _add_automation(client: Client, buses: list[ListedBus]) -> None:
-    """Let drivers charge who ask for it; what somebody made of it stays."""
+    """Add the automation for start requests, unless there is one, changed or not."""
     wanted = answer_start_requests(buses)
     entities = await client.command("config/entity_registry/list")
     there = {one["unique_id"] for one in entities if one["platform"] == "automation"}
@@ -130,7 +130,7 @@ async def _add_automation(client: Client, buses: list[ListedBus]) -> None:
 async def _show_dashboard(
     client: Client, settings: Settings, buses: list[ListedBus]
 ) -> None:
-    """Make the dashboard, or renew it where nobody has changed it."""
+    """Create the dashboard, or update it unless the user has changed it."""
     ours = settings.folder / "dashboard.json"
     wanted = dashboard(buses)
     present = await client.command("lovelace/dashboards/list")
@@ -153,7 +153,7 @@ async def _is_ours(client: Client, written: str) -> bool:
     try:
         stored = await client.command("lovelace/config", url_path=URL_PATH)
     except DemoError:
-        # An earlier start was interrupted before it saved any.
+        # An earlier start was interrupted before it saved one.
         return True
     return written != "" and stored == json.loads(written)
 

@@ -18,13 +18,13 @@ class Part:
     entities: dict[str, str] = field(default_factory=dict)
 
     def find(self, *keys: str) -> str | None:
-        """Return the first of these entities that is there."""
+        """Return the first of these entities that exists."""
         return next((self.entities[key] for key in keys if key in self.entities), None)
 
 
 @dataclass(slots=True)
 class ListedCharger(Part):
-    """A charger; what it says of its connectors stands there."""
+    """A charger; entities of its connectors belong to these."""
 
     connectors: dict[int, Part] = field(default_factory=dict)
 
@@ -39,9 +39,9 @@ class ListedBus(Part):
 def list_buses(
     entities: Iterable[Mapping[str, Any]], devices: Iterable[Mapping[str, Any]]
 ) -> list[ListedBus]:
-    """Return what is there, of the registries as the websocket API lists them.
+    """Return the buses in the registries, as the websocket API lists these.
 
-    Disabled entities are left out: a dashboard could show nothing of them.
+    Disabled entities are left out: a dashboard cannot show them.
     """
     names = {
         device["id"]: device["name_by_user"] or device["name"] for device in devices

@@ -9,49 +9,49 @@ from typing import Final
 from .settings import HOST, DemoError, Settings
 
 LISTEN_PORTS: Final = range(4712, 4812)
-"""The first free one is taken; the integration offers the same."""
+"""The first free one is used, as in the integration."""
 
 
 def check_port(settings: Settings) -> None:
-    """Raise DemoError when Home Assistant could not listen there."""
-    if why := _in_the_way(settings.port):
+    """Raise DemoError if Home Assistant cannot listen on its port."""
+    if problem := _problem_of(settings.port):
         raise DemoError(
-            f"port {settings.port} {why}; set EVSE_BUS_DEMO_PORT to another one"
+            f"port {settings.port} {problem}; set EVSE_BUS_DEMO_PORT to another one"
         )
 
 
 def with_listen_port(settings: Settings) -> Settings:
     """Return the settings with the port that boxes dial, chosen at the first start.
 
-    It is kept: Home Assistant has stored it. Raises DemoError when it is taken.
+    It is kept, because Home Assistant has stored it. Raises DemoError if it is taken.
     """
     kept = settings.folder / "listen-port"
     port = _read(kept)
     if port is None:
         port = next(
-            (p for p in LISTEN_PORTS if p != settings.port and not _in_the_way(p)), None
+            (p for p in LISTEN_PORTS if p != settings.port and not _problem_of(p)), None
         )
         if port is None:
-            raise DemoError("no port is free that an EWS-Box could dial")
+            raise DemoError("no port is free for an EWS-Box to dial")
         kept.write_text(str(port), encoding="utf-8")
-    elif why := _in_the_way(port):
+    elif problem := _problem_of(port):
         raise DemoError(
-            f"port {port}, which this demo's EWS-Box dials, {why}; end that one, or"
-            f" remove {settings.folder} to begin anew"
+            f"port {port}, which this demo's EWS-Box dials, {problem}; end that one, or"
+            f" remove {settings.folder} to start again"
         )
     return replace(settings, listen_port=port)
 
 
 def _read(kept: Path) -> int | None:
-    """Return what was written; nothing, or half of it, counts as nothing."""
+    """Return the port that was stored; ``None`` for a missing or incomplete file."""
     try:
         return int(kept.read_text(encoding="utf-8"))
     except OSError, ValueError:
         return None
 
 
-def _in_the_way(port: int) -> str:
-    """Return why nobody could listen on a port; empty: it is free."""
+def _problem_of(port: int) -> str:
+    """Return why a port cannot be used; empty: it is free."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

@@ -1,4 +1,4 @@
-"""Programs that the demo starts, and that never outlive it."""
+"""Programs that the demo starts, and ends with itself."""
 
 import asyncio
 from asyncio.subprocess import DEVNULL, Process
@@ -9,12 +9,12 @@ import signal
 from typing import Final
 
 PATIENCE: Final = 30.0
-"""Seconds a program gets to end by itself."""
+"""Longest wait for the end of a program, s."""
 TAIL: Final = 15
 
 
 class Program:
-    """One program in a process group of its own, so that Ctrl-C is ours to hand on."""
+    """One program in a process group of its own, so that Ctrl-C reaches only the demo."""
 
     def __init__(self, name: str, process: Process, log: Path) -> None:
         """Take over a process that was started."""
@@ -26,12 +26,12 @@ class Program:
     async def start(
         cls, name: str, *command: str | Path, log: Path, cwd: Path
     ) -> Program:
-        """Start it; what it prints goes into the log."""
+        """Start it; its output goes to the log."""
         environment = dict(os.environ)
         for variable in ("PYTHONDONTWRITEBYTECODE", "PYTHONPATH", "PYTHONHOME"):
             # Without stored byte code Home Assistant takes a minute at each start.
             environment.pop(variable, None)
-        # One log is enough: this one also has what is printed before any logging.
+        # One log is enough: this one also has the output before any logging.
         environment["HA_DISABLE_LOG_FILE"] = "1"
         with log.open("wb") as output:
             process = await asyncio.create_subprocess_exec(
@@ -54,17 +54,17 @@ class Program:
         """Wait for its end; return its exit code."""
         return await self._process.wait()
 
-    def last_words(self) -> str:
+    def log_tail(self) -> str:
         """Return the end of its log."""
         lines = self._log.read_text(encoding="utf-8", errors="replace").splitlines()
         return "\n".join([*lines[-TAIL:], f"(from {self._log})"])
 
     def printed(self, text: str) -> bool:
-        """Return whether it has printed something."""
+        """Return whether it has printed this text."""
         return text in self._log.read_text(encoding="utf-8", errors="replace")
 
     async def stop(self) -> None:
-        """End it, and whatever it started itself."""
+        """End it, and all processes that it started."""
         if self.running:
             with suppress(ProcessLookupError):
                 self._process.terminate()

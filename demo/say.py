@@ -1,4 +1,4 @@
-"""What the demo tells a person while it works."""
+"""Output of the demo on the terminal."""
 
 from collections.abc import Callable
 import sys
@@ -7,7 +7,7 @@ from typing import Final, Self
 
 WIDTH: Final = 78
 EVERY: Final = 5.0
-"""Seconds between two lines of progress where lines cannot be overwritten."""
+"""Seconds between two lines of progress if lines cannot be overwritten."""
 
 
 def say(text: str = "") -> None:
@@ -17,7 +17,7 @@ def say(text: str = "") -> None:
 
 
 class Progress:
-    """One thing that takes a while; `with` ends its line."""
+    """The progress of one task; `with` ends its line."""
 
     def __init__(self, title: str, clock: Callable[[], float] = time.monotonic) -> None:
         """Begin now."""
@@ -25,11 +25,11 @@ class Progress:
         self._title = title
         self._clock = clock
         self._begin = clock()
-        self._told = self._begin
+        self._printed_at = self._begin
         self._live = sys.stdout.isatty()
 
     def __enter__(self) -> Self:
-        """Say what begins."""
+        """Print the title."""
         if self._live:
             self.show()
         else:
@@ -37,7 +37,7 @@ class Progress:
         return self
 
     def __exit__(self, kind: object, *_: object) -> None:
-        """Say how long it took, if it came to its end."""
+        """Print the time it took, unless it raised."""
         if self._live:
             sys.stdout.write("\r" + " " * WIDTH + "\r")
         if kind is None:
@@ -49,7 +49,7 @@ class Progress:
         return self._clock() - self._begin
 
     def show(self, detail: str = "") -> None:
-        """Say how far it is."""
+        """Print the progress."""
         now = self._clock()
         text = f"{self._title} ... {self.seconds:.0f} s"
         if detail:
@@ -57,6 +57,6 @@ class Progress:
         if self._live:
             sys.stdout.write("\r" + f"demo: {text}"[:WIDTH].ljust(WIDTH))
             sys.stdout.flush()
-        elif now - self._told >= EVERY:
-            self._told = now
+        elif now - self._printed_at >= EVERY:
+            self._printed_at = now
             say(text)

@@ -1,4 +1,4 @@
-"""Where the demo keeps what, and how to get in."""
+"""Folders, port and login of the demo."""
 
 from dataclasses import dataclass
 import os
@@ -9,30 +9,30 @@ ROOT: Final = Path(__file__).resolve().parent.parent
 """The checkout."""
 
 HOST: Final = "127.0.0.1"
-"""Not for others: everybody knows the password."""
+"""This machine only: the password is no secret."""
 DEFAULT_PORT: Final = 8123
 HIGHEST_PORT: Final = 65535
 
 USER: Final = "demo"
-PASSWORD: Final = "demo"  # noqa: S105 - printed for everybody to use
+PASSWORD: Final = "demo"  # noqa: S105 - no secret
 
 
 class DemoError(Exception):
-    """Something a person should read; the demo ends."""
+    """An error to show to the user; the demo ends."""
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """The choices a person has, and what follows from them."""
+    """The settings of the user, and paths that follow from them."""
 
     folder: Path
     port: int = DEFAULT_PORT
     listen_port: int = 0
-    """Where an EWS-Box dials; chosen at the first start."""
+    """The port that an EWS-Box dials; chosen at the first start."""
 
     @property
     def url(self) -> str:
-        """Return where Home Assistant is."""
+        """Return the URL of Home Assistant."""
         return f"http://{HOST}:{self.port}"
 
     @property
@@ -47,7 +47,7 @@ class Settings:
 
     @property
     def log(self) -> Path:
-        """Return what Home Assistant has to say."""
+        """Return the log of Home Assistant."""
         return self.folder / "home-assistant.log"
 
     def link(self, protocol: str) -> Path:
@@ -56,7 +56,7 @@ class Settings:
 
 
 def from_environment() -> Settings:
-    """Return what was asked for; raises DemoError for a port that is none."""
+    """Return the settings of the environment; raises DemoError for an invalid port."""
     typed = os.environ.get("EVSE_BUS_DEMO_PORT") or str(DEFAULT_PORT)
     if not typed.isdecimal() or not 0 < int(typed) <= HIGHEST_PORT:
         raise DemoError(f"EVSE_BUS_DEMO_PORT is no TCP port: {typed}")

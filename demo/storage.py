@@ -1,8 +1,8 @@
-"""What Home Assistant finds at its first start: an owner, no questions, our port.
+"""Stored data for Home Assistant's first start: owner, finished onboarding, port.
 
-Written through Home Assistant's own classes, so that the formats are its own. A
-`http:` section in the configuration would not do: Home Assistant takes it over
-on trial, and stops after some minutes unless a person confirms it.
+Written through Home Assistant's own classes, so that the formats are its own. A `http:`
+section in the configuration is no way: Home Assistant takes it over on trial, and stops
+after some minutes unless a user confirms it.
 """
 
 import asyncio
@@ -33,7 +33,7 @@ logger:
   default: warning
   logs:
     custom_components.evse_bus: info
-    # Says so when something must be downloaded; requirements_demo.txt lists it all.
+    # Logs a package that must be downloaded; requirements_demo.txt lists them all.
     homeassistant.util.package: info
     # Comes with the frontend, and misses programs that no charger needs.
     haffmpeg: critical
@@ -42,7 +42,7 @@ logger:
 
 
 def prepare(settings: Settings) -> None:
-    """Write what is missing or has changed; keep everything else."""
+    """Write the files that are missing or have changed; keep all others."""
     config = settings.config
     (config / "custom_components").mkdir(parents=True, exist_ok=True)
     _link(
@@ -51,12 +51,12 @@ def prepare(settings: Settings) -> None:
     )
     write_configuration(config)
     if not settings.token.exists() or _stored_port(config) != settings.port:
-        # Home Assistant's own event loop would want to handle signals.
+        # Not on Home Assistant's own event loop, which handles signals.
         asyncio.run(_write(settings))
 
 
 def write_configuration(config: Path) -> None:
-    """Write what is in YAML; automations only where there is no file for them yet."""
+    """Write the YAML files; that of automations only if there is none yet."""
     (config / "configuration.yaml").write_text(CONFIGURATION, encoding="utf-8")
     automations = config / "automations.yaml"
     if not automations.exists():
@@ -81,7 +81,7 @@ def _stored_port(config: Path) -> int | None:
 
 
 async def _write(settings: Settings) -> None:
-    # Importing Home Assistant takes a second or two that later starts can save.
+    # Importing Home Assistant takes a second or two, which later starts save.
     from homeassistant.auth import auth_manager_from_config  # noqa: PLC0415
     from homeassistant.config_entries import ConfigEntries  # noqa: PLC0415
     from homeassistant.core import HomeAssistant  # noqa: PLC0415
@@ -103,13 +103,13 @@ async def _write(settings: Settings) -> None:
                 hass, [{"type": "homeassistant"}], []
             )
             token = await _create_owner(hass)
-            await _answer_first_questions(hass)
+            await _finish_onboarding(hass)
     finally:
-        # Also writes what is saved with a delay, such as the users. It was never
-        # started, and would not stop without force.
+        # Also writes data that are saved with a delay, such as the users. It was never
+        # started, and does not stop without force.
         await hass.async_stop(force=True)
     if token is not None:
-        # Last: only with a token everything before it is complete.
+        # Last: a token means that everything before it is complete.
         new = settings.token.with_suffix(".new")
         new.unlink(missing_ok=True)
         new.touch(mode=0o600)
@@ -146,7 +146,7 @@ async def _write_http(hass: Any, port: int) -> None:  # noqa: ANN401 - see _writ
 
 
 async def _create_owner(hass: Any) -> str:  # noqa: ANN401 - see _write
-    """Create the user, also where an interrupted start has done so; return a token."""
+    """Create the user unless an interrupted start has done so; return a token."""
     from homeassistant.auth.const import GROUP_ID_ADMIN  # noqa: PLC0415
     from homeassistant.auth.models import (  # noqa: PLC0415
         TOKEN_TYPE_LONG_LIVED_ACCESS_TOKEN,
@@ -173,7 +173,7 @@ async def _create_owner(hass: Any) -> str:  # noqa: ANN401 - see _write
     return token
 
 
-async def _answer_first_questions(hass: Any) -> None:  # noqa: ANN401 - see _write
+async def _finish_onboarding(hass: Any) -> None:  # noqa: ANN401 - see _write
     from homeassistant.components import onboarding  # noqa: PLC0415
     from homeassistant.components.onboarding.const import STEPS  # noqa: PLC0415
     from homeassistant.helpers.storage import Store  # noqa: PLC0415

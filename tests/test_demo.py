@@ -83,7 +83,7 @@ def _settings(folder: Path) -> Settings:
 
 @pytest.fixture
 def shown(monkeypatch: pytest.MonkeyPatch) -> list[list[ListedBus]]:
-    """Return what the dashboard is made of, at each start."""
+    """Return the buses on the dashboard, at each start."""
     saved: list[list[ListedBus]] = []
 
     async def show(
@@ -127,17 +127,17 @@ async def test_buses_are_added_once_and_all_is_on_the_dashboard(
         EwsDialler(loading_bay, "127.0.0.1", settings.listen_port) as dialler,
     ):
         await home.furnish(client, settings)
-        # The chargers themselves follow what the demo begins with.
+        # The chargers themselves follow the first values of the demo.
         assert [point.limits_in_force for point in points] == [(32.0,) * 3] * 2
         assert [round(box.ic_amps) for box in boxes] == [16, 10, 13]
         assert [port.limit for port in workshop.ports] == [16, 16]
         assert [port.limit for port in loading_bay.ports] == [20, 20]
         await single.wait_for_async(lambda: polled.pilot_current == 16, 15)
-        # Two cars share what is there.
+        # Two cars share the supply.
         await shared.wait_for_async(
             lambda: [slave.pilot_current for slave in slaves] == [12.5, 12.5], 15
         )
-        # A driver who presses start is answered, at the port where it was.
+        # A start request is allowed, at its own port.
         for bus, box, number in ((serial, workshop, 1), (dialler, loading_bay, 2)):
             port = box.ports[number - 1]
             await bus.wait_for_async(lambda port=port: port.status == 0x30, 15)
@@ -152,9 +152,9 @@ async def test_buses_are_added_once_and_all_is_on_the_dashboard(
 
         capsys.readouterr()
         await home.furnish(client, settings)
-        said = capsys.readouterr().out
-        assert said.count("knows this bus already") == len(BUSES)
-        assert "Loading bay: discovered: knows this box already" in said
+        output = capsys.readouterr().out
+        assert output.count("this bus is set up already") == len(BUSES)
+        assert "Loading bay: discovered: this box is set up already" in output
         assert round(boxes[0].ic_amps) == 9
         assert (await client.get(AUTOMATION))["description"] == "Mine"
         entries = hass.config_entries.async_entries(DOMAIN)
@@ -179,7 +179,7 @@ async def test_buses_are_added_once_and_all_is_on_the_dashboard(
         assert "sensor.car_park_south_module_4_power" in entities
         assert "sensor.loading_bay_port_1_last_result" in entities
         assert {one for one in entities if hass.states.get(one) is None} == set()
-        # It asks for no cards: nothing is there that would be gone at the next start.
+        # It needs no cards: no data would be lost at the next start.
         assert hass.states.get("event.workshop_card") is None
         for entry in entries:
             assert await hass.config_entries.async_unload(entry.entry_id)
@@ -197,8 +197,8 @@ async def test_a_box_that_does_not_dial_holds_up_nothing(
     monkeypatch.setattr(home, "PATIENCE", 0.1)
     monkeypatch.setattr(home, "BUSES", [bus for bus in BUSES if bus.dials])
     await home.furnish(client, _settings(tmp_path))
-    assert "Loading bay: discovered: it is not offered" in capsys.readouterr().out
-    # There is no port to answer for.
+    assert "Loading bay: discovered: not offered" in capsys.readouterr().out
+    # There is no port for the automation.
     with pytest.raises(DemoError, match="404"):
         await client.get(AUTOMATION)
     [listener] = hass.config_entries.async_entries(DOMAIN)
@@ -214,13 +214,13 @@ async def test_a_flow_that_cannot_go_on_is_closed(
     with pytest.raises(DemoError, match="port"):
         await add_entry(client, DOMAIN, answers, lambda _step: None)
     del answers["port"]
-    with pytest.raises(DemoError, match="no answer"):
+    with pytest.raises(DemoError, match="no values"):
         await add_entry(client, DOMAIN, answers, lambda _step: None)
     assert not hass.config_entries.flow.async_progress()
 
 
 def _entities(part: object) -> set[str]:
-    """Return all entities that a dashboard names, wherever."""
+    """Return all entities of a dashboard."""
     if isinstance(part, dict):
         own = {part["entity"]} if "entity" in part else set()
         return own.union(*map(_entities, part.values()))
@@ -229,7 +229,7 @@ def _entities(part: object) -> set[str]:
     return set()
 
 
-# -- What Home Assistant finds at its start --------------------------------------
+# -- Stored data -----------------------------------------------------------------
 
 
 @pytest.fixture
@@ -276,7 +276,7 @@ def _stored(folder: Path, key: str) -> dict:
 
 
 async def _owner(folder: Path, token: str) -> list[str]:
-    """Return the logins of a token's user, if it is the one and only and the owner."""
+    """Return the logins of a token's user, which must be the only one and the owner."""
     hass = HomeAssistant(str(folder / "config"))
     hass.config_entries = ConfigEntries(hass, {})
     try:
@@ -306,7 +306,7 @@ time.sleep(60)
 """
 
 
-async def test_a_program_ends_with_all_it_started(
+async def test_a_program_ends_with_all_its_processes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(processes, "PATIENCE", 0.1)
@@ -315,7 +315,7 @@ async def test_a_program_ends_with_all_it_started(
         "stubborn", sys.executable, "-c", STUBBORN, log=log, cwd=tmp_path
     )
     await _until(lambda: program.printed("started"))
-    assert "started" in program.last_words()
+    assert "started" in program.log_tail()
     child = int(log.read_text().split()[1])
     os.kill(child, 0)
     await program.stop()
@@ -325,13 +325,13 @@ async def test_a_program_ends_with_all_it_started(
 
 async def _until(reached: Callable[[], bool]) -> None:
     async with asyncio.timeout(20):
-        while not reached():  # noqa: ASYNC110 - another process's doing
+        while not reached():  # noqa: ASYNC110 - of another process
             await asyncio.sleep(0.02)
 
 
 def _alive(pid: int) -> bool:
     try:
-        # A zombie waits for whoever adopted it; it does not run.
+        # A zombie waits for its new parent; it does not run.
         return "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text()
     except OSError:
         return False

@@ -1,4 +1,4 @@
-"""The demo's parts: what can be in the way of a start, and what is pure."""
+"""The parts of the demo: obstacles to a start, and pure functions."""
 
 from pathlib import Path
 import socket
@@ -19,7 +19,7 @@ def _settings(folder: Path) -> Settings:
     return Settings(folder=folder, port=8123)
 
 
-# -- What can be in the way ------------------------------------------------------
+# -- Obstacles to a start ------------------------------------------------------
 
 
 def test_one_demo_in_one_folder(tmp_path: Path) -> None:
@@ -32,17 +32,17 @@ def test_one_demo_in_one_folder(tmp_path: Path) -> None:
         pytest.fail("two demos share a folder")
     with alone(settings):
         pass
-    # The ports that Home Assistant has stored would not be there.
+    # The ports that Home Assistant has stored would not exist.
     settings.folder.rename(tmp_path / "moved")
     with (
-        pytest.raises(DemoError, match="made in another place"),
+        pytest.raises(DemoError, match="created in another place"),
         alone(_settings(tmp_path / "moved")),
     ):
         pytest.fail("a moved folder is used")
 
 
 @pytest.mark.usefixtures("socket_enabled")
-def test_a_taken_port_is_told(tmp_path: Path) -> None:
+def test_a_taken_port_raises(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         settings = Settings(folder=tmp_path, port=server.getsockname()[1])
         with pytest.raises(DemoError, match="is taken by another program"):
@@ -65,7 +65,7 @@ def test_the_port_that_boxes_dial_is_chosen_once(
             with_listen_port(settings)
         other.close()
         assert with_listen_port(settings).listen_port == second
-    # It is kept, whichever is free by now.
+    # It is kept, whichever is free now.
     assert with_listen_port(settings).listen_port == second
     with (
         socket.create_server(("127.0.0.1", second)),
@@ -80,7 +80,7 @@ def test_the_port_that_boxes_dial_is_chosen_once(
 # -- Pure parts ------------------------------------------------------------------
 
 
-def test_a_form_is_filled_in_as_a_person_leaves_it() -> None:
+def test_a_form_is_filled_in_with_suggestions_and_defaults() -> None:
     fields = [
         {"name": "typed", "default": 1},
         {"name": "suggested", "default": 2, "description": {"suggested_value": 3}},
@@ -100,7 +100,7 @@ def test_a_form_is_filled_in_as_a_person_leaves_it() -> None:
     }
 
 
-def test_listing_leaves_out_what_cannot_be_shown() -> None:
+def test_listing_leaves_out_disabled_entities() -> None:
     def entity(unique_id: str, **more: object) -> dict[str, object]:
         return {
             "entity_id": f"sensor.{unique_id.lower()}",
@@ -145,7 +145,7 @@ def test_listing_leaves_out_what_cannot_be_shown() -> None:
     )
 
 
-def test_each_start_request_is_answered_at_its_own_port() -> None:
+def test_each_start_request_is_allowed_at_its_own_port() -> None:
     ports = {
         number: Part(
             f"Port {number}",
@@ -167,13 +167,13 @@ def test_each_start_request_is_answered_at_its_own_port() -> None:
     assert answer_start_requests([ListedBus("Bus", {}, [other])]) is None
 
 
-def test_a_dashboard_of_nothing_has_no_empty_cards() -> None:
+def test_a_dashboard_without_buses_has_no_empty_cards() -> None:
     (view,) = dashboard([])["views"]
     assert [card["type"] for card in view["sections"][0]["cards"]] == ["heading"]
 
 
 @pytest.mark.parametrize("port", ["0", "65536", "-1", "8123 ", "http", "²"])
-def test_a_port_that_is_none(port: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_invalid_port_raises(port: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EVSE_BUS_DEMO_PORT", port)
     with pytest.raises(DemoError, match="no TCP port"):
         from_environment()
