@@ -30,7 +30,6 @@ from .const import CONF_SERIAL, LOGGER, SUBENTRY_CHARGER
 from .devices import BusDevices
 from .discovery import async_set_up_now, async_wants_to_connect
 from .evse.bus import Bus
-from .evse.ews import EwsPort
 from .evse.listeners import notify
 from .evse.model import ChargerConfig, Circuit, Orders
 from .issues import BusIssues
@@ -251,10 +250,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
                 managed.bus.subscribe(partial(self._on_own_bus, managed))
             )
         managed.bus.add(charger)
-        if isinstance(charger, EwsPort):
-            managed.subscriptions.append(
-                charger.subscribe_events(managed.events.publish)
-            )
+        managed.subscriptions.append(charger.subscribe_events(managed.events.publish))
 
     async def _async_commit(self, managed: ManagedCharger, orders: Orders) -> None:
         self.issues.orders_renewed(managed)

@@ -15,7 +15,6 @@ from .connections import ListenerConnections
 from .const import CONF_SERIAL, DOMAIN
 from .coordinator import BusCoordinator, EvseBusConfigEntry
 from .evse.bus import Bus
-from .evse.smartevse import Master
 from .evse.statistics import Direction
 from .managed_charger import ManagedCharger
 
@@ -112,19 +111,14 @@ def _master(coordinator: BusCoordinator) -> dict[str, Any] | None:
     master = coordinator.connections.master
     if master is None:
         return None
-    data = {
+    details: dict[str, Any] = plain(master.details)
+    return {
         "silent": master.silent,
         "noticed": plain(master.noticed),
         "order": plain(coordinator.orders.supply),
         "statistics": plain(master.statistics),
+        **details,
     }
-    if isinstance(master, Master):
-        data["supply"] = plain(master.circuit)
-        # In tenths of an ampere, by Modbus address.
-        data["shares"] = {
-            str(address): share / 10 for address, share in master.shares().items()
-        }
-    return data
 
 
 def _charger(coordinator: BusCoordinator, managed: ManagedCharger) -> dict[str, Any]:

@@ -16,14 +16,15 @@ from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
 
 from .coordinator import BusCoordinator, EvseBusConfigEntry
 from .entity import ChargerEntity, add_charger_entities, supported
-from .evse.ews.events import (
+from .evse.events import (
+    KEYS,
     CardPresented,
     ChargeEnded,
     ChargeStarted,
     Event,
+    KeyEvent,
     StartRequested,
 )
-from .evse.ews.wire.info import KEYS, KeyEvent
 from .evse.model import Capability
 from .managed_charger import ManagedCharger
 
@@ -68,7 +69,7 @@ def _charge(event: Event) -> EventData | None:
     if isinstance(event, ChargeEnded):
         result = event.result
         return "ended", {
-            "result": None if result is None else result.name.lower(),
+            "result": None if result is None else str(result),
             "energy": event.energy,
             "duration": event.duration,
         }

@@ -12,7 +12,7 @@ from .const import LOGGER
 from .evse.bus import Bus
 from .evse.charger import Charger
 from .evse.errors import EvseError
-from .evse.ews.events import Events
+from .evse.events import Events
 from .evse.readings import ConnectorReading
 
 SHUTDOWN_TIMEOUT: Final = 5.0

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime
-from enum import StrEnum
 from typing import Any, Final
 
 from homeassistant.components.sensor import (
@@ -26,25 +25,13 @@ from homeassistant.util import dt as dt_util
 from .evse.bus import Bus
 from .evse.charger import Charger
 from .evse.ews import Listener
-from .evse.model import Capability, Fault, Phases, SessionResult, Status
+from .evse.model import Capability, FailSafe, Fault, Phases, SessionResult, Status
 from .evse.readings import ChargerReading, ConnectorReading
 
 NO_FAULT: Final = "none"
 
 WAITING: Final = frozenset({Fault.LESS_6A, Fault.NO_CURRENT, Fault.NO_SUN})
 """Reported among the faults of a box, but none: it waits for current or the sun."""
-
-
-class FailSafe(StrEnum):
-    """Behaviour of a charger that no longer hears from Home Assistant."""
-
-    NOTHING = "nothing"
-    """It keeps its last limit."""
-    FALLS_BACK = "falls_back"
-    """It charges at its fail-safe current after its time-out."""
-    STOPS = "stops"
-    ENDS = "ends"
-    """It ends the charge after 10 min, and unlocks the plug (EWS-Box)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,24 +149,6 @@ def _local(clock: datetime | None) -> datetime | None:
     if clock is None:
         return None
     return clock.replace(tzinfo=dt_util.get_default_time_zone())
-
-
-def _fail_safe(charger: Charger) -> FailSafe | None:
-    """Return the behaviour of a charger without us; ``None``: not known yet."""
-    # A fail-safe current without a time-out may apply to expired orders only.
-    if Capability.FAIL_SAFE_TIMEOUT in charger.capabilities:
-        return FailSafe.FALLS_BACK
-    if charger.follows_master:
-        return FailSafe.STOPS
-    if Capability.SERVER in charger.capabilities:
-        ends = charger.ends_in_silence
-        return None if ends is None else FailSafe.ENDS if ends else FailSafe.NOTHING
-    if Capability.UPSTREAM_TIMEOUT not in charger.capabilities:
-        return FailSafe.NOTHING
-    own = charger.info.options.get("upstream_timeout") if charger.info else None
-    if own is None:
-        return None
-    return FailSafe.STOPS if own else FailSafe.NOTHING
 
 
 CONNECTOR_SENSORS: Final[tuple[ConnectorSensorDescription, ...]] = (
@@ -331,7 +300,7 @@ CHARGER_SENSORS: Final[tuple[ChargerSensorDescription, ...]] = (
         entity_category=EntityCategory.DIAGNOSTIC,
         device_class=SensorDeviceClass.ENUM,
         options=[str(one) for one in FailSafe],
-        value=_fail_safe,
+        value=lambda charger: charger.fail_safe,
         of_box=True,
     ),
 )

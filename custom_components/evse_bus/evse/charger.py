@@ -24,6 +24,7 @@ from typing import ClassVar, Protocol, override
 
 from .conversation import Conversation, FollowUp, nothing
 from .errors import NotAvailableError
+from .events import EventListener, Events
 from .exchange import Turn, Wire
 from .framing import Frame, Timing
 from .jobs import Job, merge_key
@@ -33,6 +34,7 @@ from .model import (
     Capability,
     ChargerConfig,
     Command,
+    FailSafe,
     Fault,
     Limits,
     OrderChange,
@@ -88,8 +90,6 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
     """Applying orders meets the deadline of the regular exchange as well."""
     pauses_hurry: ClassVar[bool] = False
     """A pause does not wait for the end of the minimum interval."""
-    follows_master: ClassVar[bool] = False
-    """It stops by itself when the master of its bus falls silent."""
     bursts: ClassVar[bool] = False
     """Its conversations rest only where they must wait: many exchanges in one turn."""
 
@@ -102,6 +102,7 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         self.reading: ChargerReading | None = None
         self.info: ChargerInfo | None = None
         self.statistics = ChargerStatistics()
+        self.events = Events()
         self.last_fingerprint: tuple[object, ...] = ()
         """`fingerprint` at the last call of the listeners."""
         self.misses = 0
@@ -160,12 +161,9 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         return False
 
     @property
-    def ends_in_silence(self) -> bool | None:
-        """Return whether it ends a charge by itself when it loses its server.
-
-        ``None``: not known (yet), or it has no server.
-        """
-        return None
+    def fail_safe(self) -> FailSafe | None:
+        """Return what it does when no message comes; ``None``: not known yet."""
+        return FailSafe.NOTHING
 
     @property
     def shares_address(self) -> bool:
@@ -496,6 +494,10 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
             raise NotAvailableError(message) from error
         finally:
             stop()
+
+    def subscribe_events(self, listener: EventListener) -> Callable[[], None]:
+        """Call back for each event; return a function that ends it."""
+        return self.events.subscribe(listener)
 
     def notice(self, fault: Fault, *, present: bool) -> None:
         """Set or clear a fault found by this library; listeners hear of a change."""

@@ -6,6 +6,7 @@ master may silence the whole bus.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 
 from .charger import Charger, Scheduler
 from .exchange import Turn
@@ -49,6 +50,11 @@ class BusMaster(ChargerGroup, Observable, ABC):
     @abstractmethod
     def refusal(self) -> str | None:
         """Return why no command is accepted now; ``None``: commands are accepted."""
+
+    @property
+    def details(self) -> Mapping[str, object]:
+        """Return further values of its state, for diagnostics only."""
+        return {}
 
     @abstractmethod
     def on_line_open(self, now: float) -> None:

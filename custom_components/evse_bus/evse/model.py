@@ -146,6 +146,18 @@ class Capability(StrEnum):
     """It reports whether it is connected to its server."""
 
 
+class FailSafe(StrEnum):
+    """What a charger does when no message comes from its controller."""
+
+    NOTHING = "nothing"
+    """The last limit stays in effect."""
+    FALLS_BACK = "falls_back"
+    """It charges with its fail-safe current after its time-out."""
+    STOPS = "stops"
+    ENDS = "ends"
+    """It ends the charge after 10 min, and unlocks the plug (EWS-Box)."""
+
+
 class Persistence(StrEnum):
     """How often a command may be sent for one request of the user."""
 

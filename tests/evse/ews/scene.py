@@ -6,10 +6,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Self, override
 
 from custom_components.evse_bus.evse.bus import Bus
+from custom_components.evse_bus.evse.events import Event
 from custom_components.evse_bus.evse.ews import PROTOCOL
 from custom_components.evse_bus.evse.ews.charger import EwsPort
 from custom_components.evse_bus.evse.ews.config import EwsPortConfig
-from custom_components.evse_bus.evse.ews.events import Event
 from custom_components.evse_bus.evse.ews.port import BoxPorts
 from custom_components.evse_bus.evse.ews.timing import SETTINGS
 from custom_components.evse_bus.evse.framing import Timing

@@ -5,20 +5,18 @@ from dataclasses import replace
 
 import pytest
 
-from custom_components.evse_bus.evse.ews.events import (
+from custom_components.evse_bus.evse.events import (
     ChargeEnded,
     ChargeStarted,
     StartRequested,
-    charge_ended,
-    start_requested,
 )
+from custom_components.evse_bus.evse.ews.events import charge_ended, start_requested
 from custom_components.evse_bus.evse.ews.wire.status import (
     Card,
-    ChargeResult,
     PortStatus,
     decode_ports,
 )
-from custom_components.evse_bus.evse.model import Command, OrderChange
+from custom_components.evse_bus.evse.model import Command, OrderChange, SessionResult
 from tests.virtual.ews_rfid import Card as VirtualCard
 from tests.virtual.ews_session import Session
 
@@ -62,7 +60,7 @@ def port(session: tuple[int, int], last: tuple[int, int]) -> PortStatus:
 def test_what_has_been_charged(running: PortStatus | None, status: PortStatus) -> None:
     ended = charge_ended(2, running, status)
     assert ended == ChargeEnded(
-        port=2, result=ChargeResult.STOPPED, energy=1000, duration=100
+        port=2, result=SessionResult.STOPPED, energy=1000, duration=100
     )
 
 
@@ -170,7 +168,7 @@ def test_an_end_that_nobody_has_seen_is_told_later() -> None:
         await asyncio.sleep(10)
         (ended,) = ends(scene)
         assert ended.energy == pytest.approx(scene.box.ports[0].session.total_wh, abs=2)
-        assert ended.result is ChargeResult.PILOT_LOST
+        assert ended.result is SessionResult.PILOT_LOST
         scene.line.unplug()
         scene.cars[0].plug_in()
         await scene.until(lambda: scene.status() == 0x30)

@@ -4,11 +4,11 @@ from hypothesis import given, strategies as st
 import pytest
 
 from custom_components.evse_bus.evse.errors import ImplausibleReplyError
+from custom_components.evse_bus.evse.events import KeyEvent
 from custom_components.evse_bus.evse.ews.wire.frames import EwsFramer
 from custom_components.evse_bus.evse.ews.wire.info import (
     Change,
     Info,
-    KeyEvent,
     decode_info,
 )
 

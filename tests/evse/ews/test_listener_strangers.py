@@ -7,10 +7,10 @@ import socket
 import pytest
 
 from custom_components.evse_bus.evse import recovery
+from custom_components.evse_bus.evse.events import KEYS
 from custom_components.evse_bus.evse.ews.box import MOST_KEYS
 from custom_components.evse_bus.evse.ews.network import listener as listening
 from custom_components.evse_bus.evse.ews.network.line import AcceptedLine
-from custom_components.evse_bus.evse.ews.wire.info import KEYS
 from custom_components.evse_bus.evse.throttle import LOSSES
 from tests.simulated_time import now
 from tests.virtual.ews_box import EwsBox as VirtualBox

@@ -10,9 +10,7 @@ from custom_components.evse_bus.evse.errors import (
     NotAvailableError,
     NotConfirmedError,
 )
-from custom_components.evse_bus.evse.ews.events import (
-    ChargeEnded,
-)
+from custom_components.evse_bus.evse.events import ChargeEnded
 from custom_components.evse_bus.evse.ews.port import BoxPorts
 from custom_components.evse_bus.evse.ews.wire.answers import EwsRefusedError, Refusal
 from custom_components.evse_bus.evse.model import Fault, OrderChange, Status

@@ -8,14 +8,13 @@ from custom_components.evse_bus.evse.errors import (
     NotAvailableError,
     NotConfirmedError,
 )
-from custom_components.evse_bus.evse.ews.events import (
+from custom_components.evse_bus.evse.events import (
     ChargeEnded,
     ChargeStarted,
     StartRequested,
 )
 from custom_components.evse_bus.evse.ews.wire.states import STATES
-from custom_components.evse_bus.evse.ews.wire.status import ChargeResult
-from custom_components.evse_bus.evse.model import OrderChange, Status
+from custom_components.evse_bus.evse.model import OrderChange, SessionResult, Status
 
 from .scene import EwsScene, now, play
 
@@ -133,7 +132,7 @@ def test_a_pause_of_somebody_else_is_not_ended_by_us() -> None:
         await scene.until(lambda: scene.status() == 0x50)
         await asyncio.sleep(3)
         (ended,) = (one for one in scene.events if isinstance(one, ChargeEnded))
-        assert (ended.port, ended.result) == (1, ChargeResult.STOPPED)
+        assert (ended.port, ended.result) == (1, SessionResult.STOPPED)
         begin = now()
         await scene.charger().change_orders(ON)
         await scene.charger().change_orders(amperes(20.0))

@@ -4,8 +4,11 @@ import asyncio
 
 import pytest
 
-from custom_components.evse_bus.evse.ews.events import CardPresented, StartRequested
-from custom_components.evse_bus.evse.ews.wire.info import KeyEvent
+from custom_components.evse_bus.evse.events import (
+    CardPresented,
+    KeyEvent,
+    StartRequested,
+)
 from custom_components.evse_bus.evse.ews.wire.status import StartRelease
 from custom_components.evse_bus.evse.model import (
     OrderChange,

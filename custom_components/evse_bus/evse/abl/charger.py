@@ -12,7 +12,15 @@ from typing import Final, override
 from ..conversation import Conversation, FollowUp
 from ..errors import GarbledReplyError, NotAvailableError
 from ..exchange import Turn
-from ..model import Capability, Command, Fault, Limits, OrderChange, Orders
+from ..model import (
+    Capability,
+    Command,
+    FailSafe,
+    Fault,
+    Limits,
+    OrderChange,
+    Orders,
+)
 from ..safety import Setpoint, clamp
 from .commands import conversation_for
 from .config import AblConfig
@@ -76,6 +84,14 @@ class AblCharger(AblReader):
             # Not a value of the box: it counts when orders are not renewed.
             known |= {Capability.FAIL_SAFE_CURRENT}
         return known
+
+    @property
+    @override
+    def fail_safe(self) -> FailSafe | None:
+        own = self.info.options.get("upstream_timeout") if self.info else None
+        if own is None:
+            return None
+        return FailSafe.STOPS if own else FailSafe.NOTHING
 
     @property
     @override

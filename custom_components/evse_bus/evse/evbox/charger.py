@@ -28,7 +28,15 @@ from typing import Final, override
 from ..charger import Charger
 from ..errors import GarbledReplyError, ImplausibleReplyError, WrongChargerError
 from ..exchange import Turn
-from ..model import Capability, Fault, Limits, OrderChange, Orders, Phases
+from ..model import (
+    Capability,
+    FailSafe,
+    Fault,
+    Limits,
+    OrderChange,
+    Orders,
+    Phases,
+)
 from ..readings import ChargerReading
 from ..safety import INTERVALS_PER_TIMEOUT, MAXIMUM_TIMEOUT, Setpoint, clamp, number
 from ..schedule import Kind
@@ -140,6 +148,11 @@ class EvboxCharger(Charger[EvboxConfig]):
     def capabilities(self) -> frozenset[Capability]:
         """Return the capabilities of its command; the wire has no status."""
         return _ALWAYS | _BY_COMMAND[self.config.command]
+
+    @property
+    @override
+    def fail_safe(self) -> FailSafe:
+        return FailSafe.FALLS_BACK
 
     @property
     @override

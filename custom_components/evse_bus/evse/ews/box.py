@@ -16,9 +16,9 @@ from typing import Final
 
 from ..conversation import rest
 from ..errors import ExchangeError, LineError, ReplyTimeoutError
+from ..events import CardPresented, Events
 from ..exchange import Turn
 from ..throttle import RateLimiter
-from .events import CardPresented, Events
 from .timing import (
     BOX_INTERVAL,
     CLOCK_PAUSE,

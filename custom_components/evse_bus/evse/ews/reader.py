@@ -4,16 +4,10 @@ from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import Final, override
 
-from ..model import Capability, Fault, Limits, Orders
+from ..events import ChargeStarted, Event, EventListener, port_of
+from ..model import Capability, FailSafe, Fault, Limits, Orders
 from .config import EwsPortConfig
-from .events import (
-    ChargeStarted,
-    Event,
-    EventListener,
-    charge_ended,
-    port_of,
-    start_requested,
-)
+from .events import charge_ended, start_requested
 from .limit import Limiter
 from .permission import Permission
 from .port import BoxPort
@@ -76,11 +70,12 @@ class EwsReader(BoxPort):
 
     @property
     @override
-    def ends_in_silence(self) -> bool | None:
+    def fail_safe(self) -> FailSafe | None:
         installation = self.box.installation
         if installation is None or installation.mode is None:
             return None
-        return SystemMode.SERVER in installation.mode
+        has_server = SystemMode.SERVER in installation.mode
+        return FailSafe.ENDS if has_server else FailSafe.NOTHING
 
     @property
     @override

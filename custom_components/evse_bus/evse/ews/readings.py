@@ -138,7 +138,7 @@ def charger_reading(port: int, box: Snapshot, *, paused: bool | None) -> Charger
         session_time=status.session_time,
         last_session_energy=float(status.last_energy),
         last_session_time=status.last_time,
-        last_result=_result(status.result),
+        last_result=session_result(status.result),
         last_end=details.last_end[at],
         user=(status.card.user or None) if status.card is not None else None,
         cable_current=float(status.cable_current) if status.cable_current else None,
@@ -183,7 +183,8 @@ def asks_for_start(status: PortStatus) -> bool:
     return status.start is StartRelease.REQUESTED and status.state == WAITING
 
 
-def _result(result: ChargeResult | None) -> SessionResult | None:
+def session_result(result: ChargeResult | None) -> SessionResult | None:
+    """Return how a charge has ended."""
     return None if result is None else SessionResult[result.name]
 
 

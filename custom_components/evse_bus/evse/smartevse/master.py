@@ -8,6 +8,7 @@ another master is on the line. Source: PROTOCOLS.md, 3.
 
 from abc import ABC, abstractmethod
 import asyncio
+from collections.abc import Mapping
 from contextlib import suppress
 from enum import Enum, auto
 from functools import partial
@@ -226,6 +227,13 @@ class Master(BusMaster):
             self.draw(slave.unit)
         others = {slave.unit for slave in self.slaves if slave.has_other_dialect}
         return {u: draw for u, draw in self._draws.items() if u not in others}
+
+    @property
+    @override
+    def details(self) -> Mapping[str, object]:
+        shares = {str(unit): tenths / 10 for unit, tenths in self.shares().items()}
+        # Amperes, by Modbus address.
+        return {"supply": self.circuit, "shares": shares}
 
     def shares(self) -> dict[int, int]:
         """Return the share of each slave once all have followed, 0.1 A.

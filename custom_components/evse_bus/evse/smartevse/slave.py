@@ -25,6 +25,7 @@ from ..framing import Frame
 from ..modbus import ModbusFrame
 from ..model import (
     Capability,
+    FailSafe,
     Fault,
     Limits,
     OrderChange,
@@ -71,7 +72,6 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
     """One slave."""
 
     pauses_hurry: ClassVar = True
-    follows_master: ClassVar = True
 
     def __init__(self, config: SlaveConfig, orders: Orders) -> None:
         """Begin with an unknown box, without a share of the circuit limit."""
@@ -119,6 +119,11 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
     @override
     def worst_case(self) -> float | None:
         return self.bus.worst_case(self) if self.bus is not None else None
+
+    @property
+    @override
+    def fail_safe(self) -> FailSafe:
+        return FailSafe.STOPS
 
     @property
     @override

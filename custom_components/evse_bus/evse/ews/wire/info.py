@@ -4,17 +4,15 @@ Source: manual, 3.2.3. It may come at any moment, also between a command and its
 answer, and is a reason to poll at once.
 """
 
-from dataclasses import dataclass
 from enum import KEEP, IntFlag
 from typing import Final
 
+from ...events import KEYS, KeyEvent
 from ...fields import Flags, Number
 from ...structs import Struct, coded, many, record
 from .frames import EwsFrame, MessageId
 
 _NAME: Final = "if"
-KEYS: Final = 4
-"""Keys of a port."""
 _PRESSED: Final = 255
 _STEP: Final = 0.1
 """s"""
@@ -28,18 +26,6 @@ class Change(IntFlag, boundary=KEEP):
     PORT_2 = 1 << 1
     PORT_1 = 1 << 2
     """Start or stop by key or web page, or charging has ended."""
-
-
-@dataclass(frozen=True, slots=True)
-class KeyEvent:
-    """A key was pressed, or released after a time."""
-
-    port: int
-    """1 or 2."""
-    key: int
-    """1 to 4."""
-    held: float | None
-    """Time for which it was pressed, s; ``None``: it is pressed now."""
 
 
 @record
