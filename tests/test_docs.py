@@ -195,7 +195,7 @@ async def test_the_script_of_the_library_reads_and_sets_a_charger() -> None:
     box = AblBox(1, car=car)
     async with VirtualBus.pty(box) as bus:
         car.plug_in()
-        await bus.wait_for_async(lambda: box.state == "C2", timeout=10)
+        await bus.wait_for_async(lambda: box.state == "C2", timeout=30)
         assert "raw_state='C2'" in await run(code, bus.url)
         assert box.limits_written == [166]
         assert box.ic_amps <= 10.0
@@ -208,7 +208,7 @@ async def test_the_same_script_for_an_ews_box() -> None:
     box = EwsBox(cars=(car,))
     async with VirtualBus.pty(box) as bus:
         car.plug_in()
-        await bus.wait_for_async(lambda: box.ports[0].status == 0x30, timeout=10)
+        await bus.wait_for_async(lambda: box.ports[0].status == 0x30, timeout=30)
         assert "raw_state='0x30'" in await run(code, bus.url)
         assert box.ports[0].limit == 10
         assert not box.ports[0].contactor
@@ -223,7 +223,7 @@ async def test_the_script_that_an_ews_box_dials(unused_tcp_port: int) -> None:
     host = "127.0.0.1"
     async with EwsDialler(box, host, unused_tcp_port, retry=0.05) as bus:
         car.plug_in()
-        await bus.wait_for_async(lambda: box.ports[0].status == 0x30, timeout=10)
+        await bus.wait_for_async(lambda: box.ports[0].status == 0x30, timeout=30)
         out = await run(code, host, str(unused_tcp_port), box.serial)
         assert "raw_state='0x30'" in out
         assert "ChargeStarted(port=1)" in out

@@ -26,6 +26,8 @@ from custom_components.evse_bus.evse.line import Line, line_error
 
 pytestmark = pytest.mark.real_time
 
+PATIENCE = 30.0
+
 SETTINGS = LineSettings(baudrate=38400)
 
 
@@ -48,7 +50,7 @@ class Ear:
         self._changed.set()
 
     async def until(self, condition: Callable[[], bool]) -> None:
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(PATIENCE):
             while not condition():
                 self._changed.clear()
                 await self._changed.wait()

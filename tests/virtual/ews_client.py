@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import socket
 import struct
 import termios
-import time
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Protocol, Self
 
 from .ews_frames import FrameReader, Message, command
 from .raw_client import RawClient
@@ -26,12 +24,28 @@ PORT_FIELDS = (
 )
 
 
+class Line(Protocol):
+    """What a client needs of its end of a line."""
+
+    def time(self) -> float:
+        """Return the time, s."""
+
+    def write(self, data: bytes) -> None:
+        """Send bytes."""
+
+    def read_some(self, timeout: float) -> bytes:
+        """Return the next bytes, none at the time-out or the end."""
+
+    def close(self) -> None:
+        """Close."""
+
+
 class EwsClient:
     """Sends commands to a box, on its serial line or the connection it opened."""
 
-    def __init__(self, line: RawClient | socket.socket, bcc: Bcc = "all") -> None:
+    def __init__(self, line: Line, bcc: Bcc = "all") -> None:
         """Take an open line; it is closed with this client."""
-        self._line = line
+        self.line = line
         self._bcc: Bcc = bcc
         self._reader = FrameReader(10.0, bcc)
         self._waiting: list[Message] = []
@@ -53,34 +67,25 @@ class EwsClient:
         trace: TracebackType | None,
     ) -> None:
         """Close."""
-        self._line.close()
+        self.line.close()
 
     def write(self, data: bytes) -> None:
         """Send bytes."""
-        if isinstance(self._line, RawClient):
-            self._line.write(data)
-        else:
-            self._line.sendall(data)
+        self.line.write(data)
 
     def read(self, timeout: float = 1.0) -> bytes:
         """Return the next bytes, b"" at the time-out or the end."""
-        if isinstance(self._line, RawClient):
-            return self._line.read(1, timeout)
-        self._line.settimeout(timeout)
-        try:
-            return self._line.recv(4096)
-        except TimeoutError:
-            return b""
+        return self.line.read_some(timeout)
 
     def next(self, timeout: float = 1.0) -> Message | None:
         """Return the next message of any kind."""
-        end = time.monotonic() + timeout
+        end = self.line.time() + timeout
         while not self._waiting:
-            left = end - time.monotonic()
+            left = end - self.line.time()
             data = self.read(left) if left > 0 else b""
             if not data:
                 return None
-            segment = Segment(time.monotonic(), 0.0, data, ("box",), 0.0)
+            segment = Segment(self.line.time(), 0.0, data, ("box",), 0.0)
             self._waiting += self._reader.feed(segment)
         return self._waiting.pop(0)
 

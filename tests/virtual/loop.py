@@ -183,9 +183,17 @@ class LoopThread:
         """Block until the predicate is true; return its value.
 
         It is evaluated on the bus thread after everything that happens there, and at
-        every tick. The time-out is real time, counted by the bus.
+        every tick. The time-out is real time, counted by the bus; without a thread of
+        its own, it is the loop's time, and the loop runs until then.
         """
-        return self._wait(predicate, timeout).result()  # type: ignore[return-value]
+        future = self._wait(predicate, timeout)
+        if not self._own_thread:
+            self.loop.run_until_complete(self._ended(future))
+        return future.result()  # type: ignore[return-value]
+
+    async def _ended(self, future: concurrent.futures.Future[object]) -> None:
+        with contextlib.suppress(Exception):
+            await asyncio.wrap_future(future)
 
     async def wait_for_async(
         self,

@@ -209,7 +209,8 @@ class DirectTransport:
         """Take the protocol of the client."""
         self.protocol = protocol
         self._port = port
-        self._closed = asyncio.get_running_loop().create_future()
+        self._loop = asyncio.get_running_loop()
+        self._closed = self._loop.create_future()
 
     def write(self, data: bytes) -> None:
         """Send bytes; they are taken at once, as by a driver."""
@@ -228,8 +229,7 @@ class DirectTransport:
         """End the connection; `connection_lost` is called soon."""
         if self._port.client is self:
             self._port.client = None
-            loop = asyncio.get_running_loop()
-            loop.call_soon(self.protocol.connection_lost, error)
+            self._loop.call_soon(self.protocol.connection_lost, error)
             self._closed.set_result(None)
 
 

@@ -1,4 +1,4 @@
-"""A client of bare system calls, for the tests of the virtual chargers."""
+"""Clients of bare system calls, for the tests of the virtual chargers."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Self
 if TYPE_CHECKING:
     from types import TracebackType
 
+PATIENCE = 20.0
+"""Longest wait for an answer that is expected, s: a busy machine is slow."""
 _PREFIX = "socket://"
 
 
@@ -23,7 +25,7 @@ class RawClient:
         self._socket: socket.socket | None = None
         if url.startswith(_PREFIX):
             host, port = url.removeprefix(_PREFIX).split(":")
-            self._socket = socket.create_connection((host, int(port)), timeout=2)
+            self._socket = socket.create_connection((host, int(port)), timeout=PATIENCE)
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self.fd = self._socket.fileno()
         else:
@@ -57,7 +59,7 @@ class RawClient:
         if os.write(self.fd, data) != len(data):
             raise OSError("a short write")
 
-    def read(self, count: int, timeout: float = 2.0) -> bytes:
+    def read(self, count: int, timeout: float = PATIENCE) -> bytes:
         """Read `count` bytes, or fewer up to the time-out or the hang-up."""
         data = b""
         end = time.monotonic() + timeout
@@ -72,7 +74,15 @@ class RawClient:
             data += piece
         return data
 
-    def read_line(self, end: bytes = b"\n", timeout: float = 2.0) -> bytes:
+    def time(self) -> float:
+        """Return the real time, s."""
+        return time.monotonic()
+
+    def read_some(self, timeout: float) -> bytes:
+        """Return the next byte, none at the time-out or the hang-up."""
+        return self.read(1, timeout)
+
+    def read_line(self, end: bytes = b"\n", timeout: float = PATIENCE) -> bytes:
         """Read up to that byte, or up to the time-out."""
         data = b""
         limit = time.monotonic() + timeout
@@ -83,7 +93,7 @@ class RawClient:
             data += byte
         return data
 
-    def ask(self, data: bytes, end: bytes = b"\n", timeout: float = 2.0) -> bytes:
+    def ask(self, data: bytes, end: bytes = b"\n", timeout: float = PATIENCE) -> bytes:
         """Write, and read up to that byte."""
         self.write(data)
         return self.read_line(end, timeout)
@@ -100,3 +110,34 @@ class RawClient:
         attributes[6][termios.VMIN] = 1
         attributes[6][termios.VTIME] = 0
         termios.tcsetattr(self.fd, termios.TCSANOW, attributes)
+
+
+class RawSocket:
+    """The server's end of a connection, to read from and write to."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        """Take an open connection."""
+        self.ended = False
+        self._socket = connection
+
+    def time(self) -> float:
+        """Return the real time, s."""
+        return time.monotonic()
+
+    def close(self) -> None:
+        """Close."""
+        self._socket.close()
+
+    def write(self, data: bytes) -> None:
+        """Write all."""
+        self._socket.sendall(data)
+
+    def read_some(self, timeout: float) -> bytes:
+        """Return the next bytes, none at the time-out or the end (`ended`)."""
+        self._socket.settimeout(timeout)
+        try:
+            data = self._socket.recv(4096)
+        except TimeoutError:
+            return b""
+        self.ended = not data
+        return data

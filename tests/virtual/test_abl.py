@@ -7,11 +7,12 @@ from contextlib import contextmanager
 
 import pytest
 
+from tests.simulated_client import PortClient, living
+
 from .abl import AblBox
 from .abl_frames import duty_of, line, requests_in
 from .bus import VirtualBus
 from .car import Car
-from .raw_client import RawClient
 
 READ_FULL = b":0103002E0005C9\r\n"
 SET_10_A = b":0110001400010200A632\r\n"
@@ -21,9 +22,9 @@ SILENT = 0.03
 
 
 @contextmanager
-def line_to(*boxes: AblBox) -> Iterator[tuple[VirtualBus, RawClient]]:
-    with VirtualBus.pty(*boxes) as bus, RawClient(bus.url, "E") as client:
-        yield bus, client
+def line_to(*boxes: AblBox) -> Iterator[tuple[VirtualBus, PortClient]]:
+    with living(VirtualBus.in_loop(*boxes)) as bus:
+        yield bus, PortClient(bus)
 
 
 def write(register: int, value: int, box: int = 1) -> bytes:

@@ -11,6 +11,8 @@ import time
 
 import pytest
 
+from tests.simulated_client import PortClient, living
+
 from .abl import AblBox
 from .bus import VirtualBus
 from .device import Device
@@ -19,8 +21,6 @@ from .log import CLIENT
 from .raw_client import RawClient
 from .wire import Segment
 
-pytestmark = pytest.mark.real_time
-
 READ_FULL = b":0103002E0005C9\r\n"
 ANSWER = b">01030A2EA1110A03E803E803E847\r\n"
 E1_BYTE = 11 / 38400
@@ -28,17 +28,13 @@ E1_BYTE = 11 / 38400
 
 def test_nothing_is_faster_than_the_wire() -> None:
     box = AblBox(1, turn_round=0.002, jitter=0)
-    with VirtualBus.pty(box) as bus, RawClient(bus.url, "E") as client:
+    with living(VirtualBus.in_loop(box)) as bus:
+        client = PortClient(bus)
         client.ask(READ_FULL)
-        took = []
-        for _ in range(5):
-            begin = time.monotonic()
-            assert client.ask(READ_FULL) == ANSWER
-            took.append(time.monotonic() - begin)
+        begin = bus.time()
+        assert client.ask(READ_FULL) == ANSWER
         wire = (len(READ_FULL) + len(ANSWER)) * E1_BYTE + 0.002
-        assert min(took) >= wire
-        # On a busy machine bytes may be late, but never early.
-        assert min(took) < wire + 0.1
+        assert wire <= bus.time() - begin < wire + 0.002
         request, reply = bus.log.entries[-2:]
         assert request.end - request.t == pytest.approx(17 * E1_BYTE)
         assert reply.t - request.end >= 0.002
@@ -47,7 +43,8 @@ def test_nothing_is_faster_than_the_wire() -> None:
 
 def test_a_reply_comes_in_pieces_at_the_wires_pace() -> None:
     box = EvboxChargePoint(1, 20)
-    with VirtualBus.pty(box) as bus, RawClient(bus.url) as client:
+    with living(VirtualBus.in_loop(box)) as bus:
+        client = PortClient(bus)
         client.write(b"\x0280A06900E6008C0154003C002800500046F703\x03")
         answer = client.read(742)
         assert len(answer) == 742
@@ -62,9 +59,8 @@ def test_a_reply_comes_in_pieces_at_the_wires_pace() -> None:
 
 def test_a_request_during_a_reply_garbles_both() -> None:
     box = AblBox(1)
-    # Slow, so that even on a busy machine the request begins within the reply.
-    slow = VirtualBus.pty(box, baud=4800, parity="E")
-    with slow as bus, RawClient(bus.url, "E") as client:
+    with living(VirtualBus.in_loop(box)) as bus:
+        client = PortClient(bus)
         client.write(READ_FULL)
         first = client.read(8)
         client.write(READ_FULL)
@@ -81,12 +77,13 @@ def test_a_request_during_a_reply_garbles_both() -> None:
 
 
 def test_echo() -> None:
-    with VirtualBus.pty(AblBox(1)) as bus, RawClient(bus.url, "E") as client:
+    with living(VirtualBus.in_loop(AblBox(1))) as bus:
+        client = PortClient(bus)
         bus.faults.echo = True
-        begin = time.monotonic()
+        begin = bus.time()
         client.write(READ_FULL)
         assert client.read(17) == READ_FULL
-        assert time.monotonic() - begin >= 17 * E1_BYTE
+        assert bus.time() - begin == pytest.approx(17 * E1_BYTE)
         assert client.read(31) == ANSWER
         bus.faults.echo = False
         assert client.ask(READ_FULL) == ANSWER
@@ -94,7 +91,8 @@ def test_echo() -> None:
 
 def test_injected_frames_reach_client_and_devices() -> None:
     box = AblBox(1)
-    with VirtualBus.pty(box) as bus, RawClient(bus.url, "E") as client:
+    with living(VirtualBus.in_loop(box)) as bus:
+        client = PortClient(bus)
         client.ask(READ_FULL)
         bus.inject(b":0110001400010200A632\r\n")
         assert client.read_line() == b":0110001400010200A632\r\n"
@@ -103,7 +101,8 @@ def test_injected_frames_reach_client_and_devices() -> None:
 
 
 def test_another_master() -> None:
-    with VirtualBus.pty(AblBox(1)) as bus, RawClient(bus.url, "E") as client:
+    with living(VirtualBus.in_loop(AblBox(1))) as bus:
+        client = PortClient(bus)
         client.ask(READ_FULL)
         bus.foreign_traffic(b"XYZ\n", every=0.02)
         for _ in range(3):
@@ -115,14 +114,16 @@ def test_another_master() -> None:
 
 
 def test_noise() -> None:
-    with VirtualBus.pty(AblBox(1), seed=3) as bus, RawClient(bus.url) as client:
+    with living(VirtualBus.in_loop(AblBox(1), seed=3)) as bus:
+        client = PortClient(bus)
         client.ask(READ_FULL)
         bus.faults.noise_rate = 1000
         assert len(client.read(3)) == 3
 
 
 def test_bytes_written_in_pieces_are_one_frame() -> None:
-    with VirtualBus.pty(AblBox(1)) as bus, RawClient(bus.url, "E") as client:
+    with living(VirtualBus.in_loop(AblBox(1))) as bus:
+        client = PortClient(bus)
         for index in range(len(READ_FULL)):
             client.write(READ_FULL[index : index + 1])
         assert client.read_line() == ANSWER
@@ -143,6 +144,7 @@ def test_waiting_from_another_thread() -> None:
             bus.call(lambda: 1 // 0)
 
 
+@pytest.mark.real_time
 async def test_waiting_without_blocking() -> None:
     box = AblBox(1)
     async with VirtualBus.pty(box) as bus:
@@ -168,7 +170,8 @@ def test_time_can_be_scaled_and_skipped() -> None:
 
 def test_devices_can_come_and_go() -> None:
     box = AblBox(1)
-    with VirtualBus.pty(box) as bus, RawClient(bus.url, "E") as client:
+    with living(VirtualBus.in_loop(box)) as bus:
+        client = PortClient(bus)
         client.ask(READ_FULL)
         bus.remove(box)
         assert client.ask(READ_FULL, timeout=0.05) == b""
@@ -195,7 +198,8 @@ def test_line_settings_must_agree() -> None:
 
 
 def test_stats() -> None:
-    with VirtualBus.pty(AblBox(1)) as bus, RawClient(bus.url, "E") as client:
+    with living(VirtualBus.in_loop(AblBox(1))) as bus:
+        client = PortClient(bus)
         client.ask(READ_FULL)
         stats = bus.stats()
     assert stats["bytes"] == 48
@@ -228,6 +232,7 @@ def test_frozen_time_does_not_stop_the_bus(freezer: object) -> None:
             bus.wait_for(lambda: False, timeout=0.02)
 
 
+@pytest.mark.real_time
 async def test_a_cancelled_wait_leaves_no_waiter() -> None:
     async with VirtualBus.pty(AblBox(1)) as bus:
         waiting = asyncio.create_task(bus.wait_for_async(lambda: bus.opened))

@@ -19,6 +19,7 @@ from .raw_client import RawClient
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "virtual-chargers"
 READ_FULL = b":0103002E0005C9\r\n"
+PATIENCE = 30.0
 
 
 @contextmanager
@@ -36,7 +37,7 @@ def running(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
         yield process, url
     finally:
         process.terminate()
-        process.communicate(timeout=5)
+        process.communicate(timeout=PATIENCE)
 
 
 def test_abl(tmp_path: Path) -> None:
@@ -58,7 +59,7 @@ def test_abl(tmp_path: Path) -> None:
             answer = client.ask(READ_FULL)
             assert answer[11:15] in (b"93E8", b"13E8")
         process.send_signal(signal.SIGTERM)
-        assert process.wait(5) == 0
+        assert process.wait(PATIENCE) == 0
     counters = json.loads(stats.read_text())
     assert counters["devices"]["abl-1"]["requests"] == 2
     assert counters["devices"]["abl-2"]["requests"] == 0
@@ -69,7 +70,7 @@ def test_cars_that_come_and_go() -> None:
     """With `--away` cars come sooner than by default."""
     arguments = ["--cars", "auto", "--away", "0", "0"]
     with running("abl", *arguments) as (_, url), RawClient(url, "E") as client:
-        deadline = time.monotonic() + 4
+        deadline = time.monotonic() + PATIENCE
         while client.ask(READ_FULL)[9:11] not in (b"B1", b"B2", b"C2"):
             assert time.monotonic() < deadline
 
@@ -101,7 +102,7 @@ def test_smartevse(tmp_path: Path) -> None:
             assert answers[3].startswith("error fail 2 1: no such command")
             assert client.read(6).hex() == "0206000200c8"
         process.send_signal(signal.SIGTERM)
-        assert process.wait(5) == 0
+        assert process.wait(PATIENCE) == 0
     counters = json.loads(stats.read_text())["devices"]
     assert counters["smartevse-0"]["requests"] == 1
     assert counters["smartevse-2"]["unasked"] >= 1
@@ -120,6 +121,6 @@ def test_smartevse_dialects() -> None:
 def test_drivers_at_an_ews_box() -> None:
     arguments = ["--cars", "plugged", "--drivers", "--time-scale", "8"]
     with running("ews", *arguments) as (_, url), EwsClient.serial(url) as client:
-        deadline = time.monotonic() + 4
+        deadline = time.monotonic() + PATIENCE
         while [port["start_mode"] for port in client.ports()] != [1, 1]:
             assert time.monotonic() < deadline

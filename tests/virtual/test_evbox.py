@@ -7,11 +7,12 @@ from contextlib import contextmanager
 
 import pytest
 
+from tests.simulated_client import PortClient, living
+
 from .bus import VirtualBus
 from .car import Car
 from .evbox import EvboxChargePoint, Module
 from .evbox_frames import checksums, frame, orders_in, requests_without_silence
-from .raw_client import RawClient
 
 MANUAL_69 = b"\x0280A06900E6008C0154003C002800500046F703\x03"
 LIMITS = "00E6008C0154003C002800500046"
@@ -20,10 +21,9 @@ SILENT = 0.15
 
 
 @contextmanager
-def line_to(*points: EvboxChargePoint) -> Iterator[tuple[VirtualBus, RawClient]]:
-    with VirtualBus.pty(*points) as bus, RawClient(bus.url) as client:
-        bus.wait_for(lambda: bus.connected)
-        yield bus, client
+def line_to(*points: EvboxChargePoint) -> Iterator[tuple[VirtualBus, PortClient]]:
+    with living(VirtualBus.in_loop(*points)) as bus:
+        yield bus, PortClient(bus)
 
 
 def polite(bus: VirtualBus) -> None:
@@ -38,7 +38,7 @@ def command(number: int, limits: str = LIMITS, serial: str = "01923054") -> byte
     return frame(f"80A0{number}{addressed}{limits}")
 
 
-def ask(client: RawClient, data: bytes) -> str:
+def ask(client: PortClient, data: bytes) -> str:
     answer = client.ask(data, b"\x03")
     assert answer[:1] == b"\x02"
     text = answer[1:-1].decode()

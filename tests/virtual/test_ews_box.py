@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 import struct
-import time
 
 import pytest
+
+from tests.simulated_client import PortClient, living, wait
 
 from .bus import VirtualBus
 from .car import Car
@@ -26,9 +27,8 @@ SIZES |= {"ri": 130, "rp": 27, "rs": 105, "ru": 34, "rz": 64}
 
 @contextmanager
 def line_to(box: EwsBox) -> Iterator[tuple[VirtualBus, EwsClient]]:
-    with VirtualBus.pty(box) as bus, EwsClient.serial(bus.url, box.bcc) as client:
-        bus.wait_for(lambda: bus.connected)
-        yield bus, client
+    with living(VirtualBus.in_loop(box)) as bus:
+        yield bus, EwsClient(PortClient(bus), box.bcc)
 
 
 def charging(bus: VirtualBus, box: EwsBox, client: EwsClient, car: Car) -> None:
@@ -84,9 +84,9 @@ def test_other_messages_are_ignored() -> None:
 
 def test_a_command_with_a_pause_is_dropped() -> None:
     box = EwsBox()
-    with line_to(box) as (_, client):
+    with line_to(box) as (bus, client):
         client.write(command("id")[:4])
-        time.sleep(0.15)
+        wait(bus, 0.15)
         assert len(client.ask("id")) == 11
         assert box.frames.counters.timeouts == 1
 

@@ -4,25 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from random import Random
-import time
 
 import pytest
+
+from tests.simulated_client import PortClient, living
 
 from .abl import AblBox
 from .bus import VirtualBus
 from .faults import Faults
-from .raw_client import RawClient
 
 READ_FULL = b":0103002E0005C9\r\n"
 ANSWER = b">01030A2EA1110A03E803E803E847\r\n"
-Line = tuple[VirtualBus, AblBox, RawClient]
+Line = tuple[VirtualBus, AblBox, PortClient]
 
 
 @pytest.fixture
 def line() -> Iterator[Line]:
     box = AblBox(1)
-    with VirtualBus.pty(box) as bus, RawClient(bus.url, "E") as client:
-        yield bus, box, client
+    with living(VirtualBus.in_loop(box)) as bus:
+        yield bus, box, PortClient(bus)
 
 
 @pytest.mark.parametrize("where", ["bus", "device"])
@@ -36,9 +36,9 @@ def test_lost_once(line: Line, where: str) -> None:
 def test_late_once(line: Line) -> None:
     _, box, client = line
     box.faults.once("late", 0.1)
-    begin = time.monotonic()
+    begin = client.time()
     assert client.ask(READ_FULL) == ANSWER
-    assert time.monotonic() - begin > 0.11
+    assert client.time() - begin > 0.11
 
 
 def test_twice(line: Line) -> None:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-import termios
 
 import pytest
 
+from tests.simulated_client import PortClient, living
+
 from .bus import VirtualBus
 from .car import Car
-from .raw_client import RawClient
 from .smartevse import SmartEvse
 from .smartevse_alone import SmartEvseAlone
 from .smartevse_frames import (
@@ -26,12 +26,9 @@ A, B, C = (ord(letter) for letter in "ABC")
 
 
 @contextmanager
-def line_to(*boxes: SmartEvse) -> Iterator[tuple[VirtualBus, RawClient]]:
-    with (
-        VirtualBus.pty(*boxes) as bus,
-        RawClient(bus.url, "N", termios.B9600) as client,
-    ):
-        yield bus, client
+def line_to(*boxes: SmartEvse) -> Iterator[tuple[VirtualBus, PortClient]]:
+    with living(VirtualBus.in_loop(*boxes)) as bus:
+        yield bus, PortClient(bus)
 
 
 def charging(

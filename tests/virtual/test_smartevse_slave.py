@@ -6,6 +6,8 @@ import itertools
 
 import pytest
 
+from tests.simulated_client import living
+
 from .bus import VirtualBus
 from .car import Car
 from .smartevse import SmartEvse
@@ -305,7 +307,7 @@ def test_two_slaves_and_their_master_on_the_wire() -> None:
     cars = [Car(), Car()]
     slaves = [SmartEvse(load_balance=2 + n, car=cars[n]) for n in range(2)]
     master = SmartEvse(load_balance=1, settings={"circuit": 20})
-    with VirtualBus.pty(master, *slaves) as bus:
+    with living(VirtualBus.in_loop(master, *slaves)) as bus:
         bus.wait_for(lambda: all(slave.broadcasts for slave in slaves))
         cars[0].plug_in()
         cars[1].plug_in()
@@ -326,7 +328,7 @@ def test_two_slaves_and_their_master_on_the_wire() -> None:
 
 
 def test_another_master_of_a_later_dialect() -> None:
-    with VirtualBus.pty(SmartEvse("later", load_balance=1)) as bus:
+    with living(VirtualBus.in_loop(SmartEvse("later", load_balance=1))) as bus:
         bus.advance(2)
         bus.wait_for(lambda: len(bus.log) > 0)
         heard = smartevse_requests_in(bus.log.entries)[0]

@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 import json
 from pathlib import Path
-import termios
 from typing import Any
 
 import pytest
 
+from tests.simulated_client import PortClient, living
+
 from .bus import VirtualBus
-from .raw_client import RawClient
 from .smartevse import SmartEvse
 from .smartevse_alone import SmartEvseAlone
 from .smartevse_frames import write_several_frame
@@ -216,7 +216,8 @@ def test_normal_on_the_wire() -> None:
     """The same bytes through the port, at the pace of the line."""
     box = SmartEvse()
     box.outlet.pilot_voltage = 12
-    with VirtualBus.pty(box) as bus, RawClient(bus.url, "N", termios.B9600) as client:
+    with living(VirtualBus.in_loop(box)) as bus:
+        client = PortClient(bus)
         for entry in TRACE["normal"]:
             pilot, seconds = BEFORE_NORMAL.get(entry["what"], (None, 0.0))
             box.outlet.pilot_voltage = pilot or box.outlet.pilot_voltage
