@@ -21,7 +21,7 @@ from . import (
 )
 from .figures import Figure, results, table
 from .machine import OUTPUT, machine
-from .progress import say
+from .progress import report
 
 BENCHMARKS: Final = {
     one.NAME: one
@@ -49,7 +49,7 @@ def main() -> int:
     failed: list[str] = []
     for name in options.names or BENCHMARKS:
         benchmark = BENCHMARKS[name]
-        say(f"-- {name}")
+        report(f"-- {name}")
         methods[name] = benchmark.METHOD
         try:
             figures += asyncio.run(benchmark.run(quick=options.quick))

@@ -9,7 +9,7 @@ from custom_components.evse_bus.evse.abl import PROTOCOL
 
 from .figures import Figure, gaps, percentile
 from .oracle import LoggedFrame, Oracle
-from .progress import say
+from .progress import report
 from .setup import READING_REQUEST, abl_bus, settled, starts_of
 
 NAME = "abl-scan"
@@ -33,15 +33,15 @@ IDEAL = len(IDS) * (WIRE_TIME + TURN_ROUND)
 
 async def run(*, quick: bool) -> list[Figure]:
     """Return the figures."""
-    say("16 boxes polled without pause")
+    report("16 boxes polled without pause")
     log = await _watch(IDS, seconds=6 if quick else 40)
     periods = [p for one in IDS for p in gaps(starts_of(log, one, READING_REQUEST))]
-    say("one box alone")
+    report("one box alone")
     alone = _periods_of_first(await _watch([1], seconds=3 if quick else 8))
-    say("one box with 15 dead ones")
+    report("one box with 15 dead ones")
     log = await _watch(IDS, dead=DEAD, seconds=15 if quick else 60)
     living = _periods_of_first(log)
-    say("15 boxes die at the same moment")
+    report("15 boxes die at the same moment")
     dying = _periods_of_first(await _watch(IDS, kill=DEAD, seconds=8))
     grown = max(living) - fmean(alone)
     return [

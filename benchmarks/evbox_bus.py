@@ -5,7 +5,7 @@ from statistics import fmean
 
 from .figures import Figure, gaps, percentile
 from .oracle import LoggedFrame, Oracle
-from .progress import say
+from .progress import report
 from .setup import evbox_bus
 
 NAME = "evbox-bus"
@@ -32,11 +32,11 @@ async def run(*, quick: bool) -> list[Figure]:
         bus = evbox_bus(oracle.url, SERIALS, period=PERIOD, timeout=TIMEOUT)
         await bus.start()
         try:
-            say("8 ChargePoints are polled for the first time")
+            report("8 ChargePoints are polled for the first time")
             await asyncio.sleep(WARM_UP)
             loop = asyncio.get_running_loop()
             since, busy = loop.time(), bus.wire.statistics.busy_time
-            say(f"8 ChargePoints of 20 modules for {seconds:.0f} s")
+            report(f"8 ChargePoints of 20 modules for {seconds:.0f} s")
             await asyncio.sleep(seconds)
             elapsed = loop.time() - since
             busy = bus.wire.statistics.busy_time - busy

@@ -11,7 +11,7 @@ from .figures import Figure, percentile
 from .house import LOADED, House, free_port
 from .house_boxes import box_entry
 from .oracle import LoggedFrame, Oracle
-from .progress import say
+from .progress import report
 
 NAME = "ews-events"
 _figure = partial(Figure, NAME)
@@ -86,7 +86,7 @@ async def run(*, quick: bool) -> list[Figure]:
     seconds = 10.0 if quick else 90.0
     figures: list[Figure] = []
     async with asyncio.timeout(LONGEST):
-        say("starting Home Assistant")
+        report("starting Home Assistant")
         async with House() as house:
             # Its work after the start is not measured.
             await house.do("cost", seconds=5.0 if quick else 45.0)
@@ -135,7 +135,7 @@ async def _measure(
     await house.do("cost", seconds=5.0)
     figures: list[Figure] = []
     for kind in (KEY, START):
-        say(f"{name}: {kind.name}s for {seconds:.0f} s")
+        report(f"{name}: {kind.name}s for {seconds:.0f} s")
         watched, done = await asyncio.gather(
             house.do(
                 "watch_states",

@@ -13,7 +13,7 @@ from .figures import Figure, gaps, percentile
 from .house import LOADED, House, free_port
 from .house_boxes import box_entry
 from .oracle import Oracle
-from .progress import say
+from .progress import report
 
 NAME = "ews-listener"
 _figure = partial(Figure, NAME)
@@ -49,14 +49,14 @@ async def run(*, quick: bool) -> list[Figure]:
     boxes = [{"serial": serial} for serial in serials]
     port = free_port()
     async with asyncio.timeout(LONGEST):
-        say("starting Home Assistant")
+        report("starting Home Assistant")
         async with House() as house:
             # Its work after the start is not measured.
             await house.do("cost", seconds=15.0 if quick else 45.0)
-            say(f"idle, 2 x {seconds:.0f} s")
+            report(f"idle, 2 x {seconds:.0f} s")
             idle = await measure(house, seconds)
             async with Oracle("ews", boxes=boxes, dial=f"127.0.0.1:{port}") as oracle:
-                say(f"adding {BOXES} boxes that dial already")
+                report(f"adding {BOXES} boxes that dial already")
                 entry = box_entry(
                     serials, interval=INTERVAL, host="127.0.0.1", port=port
                 )
@@ -89,16 +89,16 @@ async def _polled(
     counted = await house.do("statistics")
     before = (await oracle.stats())["dropped"]
     since = time.monotonic()
-    say(f"{BOXES} boxes with free ports, 2 x {seconds:.0f} s")
+    report(f"{BOXES} boxes with free ports, 2 x {seconds:.0f} s")
     free = await measure(house, seconds)
     polls = [_Window(since, time.monotonic())]
-    say("all charge")
+    report("all charge")
     await oracle.plug_in()
     # A car is detected within a second; its port is read every two.
     await house.do("cost", seconds=5.0)
     took = await house.do("charge")
     await house.do("cost", seconds=10.0)
-    say(f"{BOXES} boxes with 100 cars, 2 x {seconds:.0f} s")
+    report(f"{BOXES} boxes with 100 cars, 2 x {seconds:.0f} s")
     begun = time.monotonic()
     charging = await measure(house, seconds)
     polls.append(_Window(begun, time.monotonic()))
@@ -149,7 +149,7 @@ def _charging(stats: Mapping[str, Any]) -> int:
 
 async def _away(house: House, oracle: Oracle, seconds: float) -> list[Figure]:
     """Pull all network cables, and plug them in again."""
-    say(f"all network cables pulled for {seconds:.0f} s")
+    report(f"all network cables pulled for {seconds:.0f} s")
     before = await house.do("statistics")
     pulled = time.monotonic()
     await oracle.unplug()
@@ -184,7 +184,7 @@ async def _until_polled(oracle: Oracle, since: float) -> float:
 
 
 async def _reloaded(house: House) -> list[Figure]:
-    say("the listener is reloaded")
+    report("the listener is reloaded")
     reloaded = await house.do("reload")
     counted = await house.do("statistics")
     return [

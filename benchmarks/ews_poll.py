@@ -8,7 +8,7 @@ from typing import Final
 
 from .figures import Figure, gaps, percentile
 from .oracle import LoggedFrame, Oracle
-from .progress import say
+from .progress import report
 from .setup import ews_bus, settled
 
 NAME = "ews-poll"
@@ -38,11 +38,11 @@ which count from the end of a poll."""
 
 async def run(*, quick: bool) -> list[Figure]:
     """Return the figures."""
-    say("two ports polled without pause")
+    report("two ports polled without pause")
     fast = await _periods((1, 2), interval=0.0, seconds=6 if quick else 40)
-    say("one port polled without pause")
+    report("one port polled without pause")
     one = await _periods((1,), interval=0.0, seconds=6 if quick else 40)
-    say("two ports polled every 2 s")
+    report("two ports polled every 2 s")
     slow = await _periods((1, 2), interval=INTERVAL, seconds=12 if quick else 120)
     late = [period - INTERVAL for period in slow]
     return [

@@ -15,7 +15,7 @@ from custom_components.evse_bus.evse.errors import PortBusyError
 from custom_components.evse_bus.evse.framing import LineSettings
 
 from .figures import Figure
-from .progress import say
+from .progress import report
 from .responder import ABL, ABL_PIECES, MODBUS, MODBUS_PIECES, Responder
 from .setup import abl_bus, settled
 
@@ -50,7 +50,7 @@ async def run(*, quick: bool) -> list[Figure]:
     )
     async with Responder() as responder:
         for name, line, ours, theirs, exchanges in plans:
-            say(f"{exchanges} exchanges a round, answers {name}")
+            report(f"{exchanges} exchanges a round, answers {name}")
             rounds = 3 if quick else 9
             times = []
             for _ in range(rounds):

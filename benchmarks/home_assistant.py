@@ -6,7 +6,7 @@ from .cost import block_figure, busy_figure, cost_figures, measure
 from .figures import Figure
 from .house import LOADED, House
 from .oracle import Oracle
-from .progress import say
+from .progress import report
 from .setup import ABL_LIMIT, EVBOX_LIMIT
 
 NAME = "home-assistant"
@@ -35,17 +35,17 @@ async def run(*, quick: bool) -> list[Figure]:
         Oracle("abl", ids=list(IDS), plugged=True) as abl,
         Oracle("evbox", serials=list(SERIALS), modules=MODULES) as evbox,
     ):
-        say("starting Home Assistant")
+        report("starting Home Assistant")
         async with House() as house:
             # Its work after the start is not measured.
             await house.do("cost", seconds=15.0 if quick else 45.0)
-            say(f"idle, 2 x {seconds:.0f} s")
+            report(f"idle, 2 x {seconds:.0f} s")
             idle = await measure(house, seconds)
-            say("adding 16 ABL boxes and 8 ChargePoints of 20 modules")
+            report("adding 16 ABL boxes and 8 ChargePoints of 20 modules")
             adding = await house.do("watched_add", buses=[_abl(abl), _evbox(evbox)])
             # EVBox: two replies must agree, and until then its minimum interval is long.
             await house.do("cost", seconds=30.0)
-            say(f"all polled, 2 x {seconds:.0f} s")
+            report(f"all polled, 2 x {seconds:.0f} s")
             polled = await measure(house, seconds)
     return [
         *cost_figures(NAME, idle, polled, "all chargers"),

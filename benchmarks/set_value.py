@@ -8,7 +8,7 @@ from statistics import fmean
 from .figures import Figure, percentile
 from .house import LOADED, House
 from .oracle import LoggedFrame, Oracle
-from .progress import say
+from .progress import report
 from .setup import ABL_LIMIT, LIMIT_REQUEST, unit_of
 
 NAME = "set-value"
@@ -45,7 +45,7 @@ class _Call:
 async def run(*, quick: bool) -> list[Figure]:
     """Return the figures."""
     ids = list(range(1, 17))
-    say("starting Home Assistant")
+    report("starting Home Assistant")
     async with Oracle("abl", ids=ids) as oracle, House() as house:
         await house.do(
             "add",
@@ -64,7 +64,7 @@ async def run(*, quick: bool) -> list[Figure]:
             ],
         )
         times = 64 if quick else 480
-        say(f"{times} times number.set_value")
+        report(f"{times} times number.set_value")
         called = await house.do("set_values", times=times, values=[ABL_LIMIT, LOW])
         await asyncio.sleep(0.1)
         log = await oracle.log()

@@ -24,7 +24,7 @@ from .balancing import (
 from .figures import Figure, gaps, percentile
 from .offers import Offer
 from .oracle import Oracle
-from .progress import say
+from .progress import report
 from .random_commands import RandomCommands
 from .set_points import (
     HIGH,
@@ -70,11 +70,11 @@ TOO_LONG: Final = 5.0
 
 async def run(*, quick: bool) -> list[Figure]:
     """Return the figures."""
-    say("two slaves with cars that come and go")
+    report("two slaves with cars that come and go")
     both = await _busy(20.0 if quick else 600.0)
-    say("the same with one of them dead")
+    report("the same with one of them dead")
     one = await _busy(20.0 if quick else 120.0, dead=True)
-    say("set-points")
+    report("set-points")
     return [*both, *one, *await _set_points(10 if quick else 100)]
 
 
@@ -229,7 +229,7 @@ async def _set_points(times: int) -> list[Figure]:
             chargers = list(bus.chargers.values())
             await until_all_charge(oracle, chargers)
             called = await set_points(chargers, times)
-            say("one box lowered, so that the other may go up")
+            report("one box lowered, so that the other may go up")
             freed, restored = await _shares(bus, times // 5)
         finally:
             await bus.stop()

@@ -5,7 +5,7 @@ from typing import Final
 
 from .figures import Figure
 from .oracle import Oracle
-from .progress import say
+from .progress import report
 from .set_points import set_point_figures, set_points, until_all_charge
 from .setup import settled, smartevse_bus
 
@@ -25,7 +25,7 @@ UNITS: Final = {"2.17": 0, "2.20": 1, "later": 1}
 async def run(*, quick: bool) -> list[Figure]:
     """Return the figures."""
     times = 6 if quick else 40
-    say(f"{times} set-points in each dialect")
+    report(f"{times} set-points in each dialect")
     all_of_them = await asyncio.gather(*(_one(one, times) for one in UNITS))
     return [figure for one in all_of_them for figure in one]
 

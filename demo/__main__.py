@@ -13,9 +13,9 @@ from .client import Client
 from .home import furnish
 from .ports import check_port, with_listen_port
 from .processes import Program
-from .say import Progress, say
 from .settings import PASSWORD, ROOT, USER, DemoError, Settings, from_environment
 from .storage import prepare
+from .terminal import Progress, report
 
 GLANCE: Final = 0.2
 BUS_PATIENCE: Final = 15.0
@@ -35,7 +35,7 @@ def main() -> int:
             prepare(settings)
             asyncio.run(_until_signal(settings))
     except DemoError as error:
-        say(f"FAILED: {error}")
+        report(f"FAILED: {error}")
         return 1
     except KeyboardInterrupt:
         # Before anything was started.
@@ -80,11 +80,11 @@ async def _until_signal(settings: Settings) -> None:
             await demo
     finally:
         if any(program.running for program in programs):
-            say("stopping ...")
+            report("stopping ...")
         # Home Assistant first: its chargers must not disappear before it.
         for program in reversed(programs):
             await program.stop()
-        say("stopped")
+        report("stopped")
 
 
 async def _run(settings: Settings, programs: list[Program]) -> None:
@@ -98,7 +98,7 @@ async def _run(settings: Settings, programs: list[Program]) -> None:
         )
     )
     lines = [str(settings.link(bus.protocol)) for bus in BUSES if not bus.dials]
-    say(f"virtual buses: {', '.join(lines)}")
+    report(f"virtual buses: {', '.join(lines)}")
     while True:
         home = await _start_home(settings)
         programs.append(home)
@@ -115,7 +115,7 @@ async def _run(settings: Settings, programs: list[Program]) -> None:
             program = waits[ended.pop()]
             raise DemoError(f"{program.name} has ended:\n{program.log_tail()}")
         programs.remove(home)
-        say("Home Assistant restarts")
+        report("Home Assistant restarts")
 
 
 async def _start_bus(settings: Settings, bus: DemoBus) -> Program:
@@ -169,12 +169,12 @@ async def _wait_until_running(client: Client, home: Program) -> None:
 
 
 def _welcome(settings: Settings) -> None:
-    say()
-    say(f"Home Assistant is ready:  {settings.url}")
-    say(f"  user {USER}, password {PASSWORD}; the dashboard is called Chargers")
-    say(f"  a long-lived token is in {settings.token}")
-    say(f"  its log is {settings.log}")
-    say("Ctrl-C stops everything.")
+    report()
+    report(f"Home Assistant is ready:  {settings.url}")
+    report(f"  user {USER}, password {PASSWORD}; the dashboard is called Chargers")
+    report(f"  a long-lived token is in {settings.token}")
+    report(f"  its log is {settings.log}")
+    report("Ctrl-C stops everything.")
 
 
 if __name__ == "__main__":

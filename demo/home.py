@@ -11,8 +11,8 @@ from .client import Client
 from .dashboard import ICON, TITLE, URL_PATH, dashboard
 from .flow import add_discovered, add_entry, find_offer
 from .listing import DOMAIN, ListedBus, list_buses
-from .say import Progress, say
 from .settings import DemoError, Settings
+from .terminal import Progress, report
 
 PATIENCE: Final = 60.0
 """Longest wait until all chargers show all their connectors, s."""
@@ -100,7 +100,7 @@ async def _all_listed(client: Client) -> list[ListedBus]:
             if listed >= expected:
                 return buses
             if progress.seconds > PATIENCE:
-                say(f"only {listed} of {expected} connectors have reported")
+                report(f"only {listed} of {expected} connectors have reported")
                 return buses
             progress.show(f"{listed} of {expected} connectors")
             await asyncio.sleep(GLANCE)

@@ -262,8 +262,8 @@ class VirtualBus(LoopThread):
         With `polite` it sends only after that much silence (s), else at any time.
         """
 
-        def talk(index: int) -> None:
-            self._foreign[index] = self.loop.call_later(every, talk, index)
+        def send(index: int) -> None:
+            self._foreign[index] = self.loop.call_later(every, send, index)
             start = self.time()
             if polite and start - self.wire.idle_from < polite:
                 return
@@ -271,7 +271,7 @@ class VirtualBus(LoopThread):
 
         def begin() -> None:
             index = len(self._foreign)
-            self._foreign.append(self.loop.call_later(every, talk, index))
+            self._foreign.append(self.loop.call_later(every, send, index))
 
         self.call(begin)
 

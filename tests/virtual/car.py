@@ -170,11 +170,11 @@ class Car:
             self.current = self._target = self._new_target = 0.0
             self._new_target_at = now
             return 0.0
-        wish = 0.0
+        target = 0.0
         if self.requesting and offered >= self.min_current:
-            wish = min(offered * self.greedy, self.max_current)
-        if wish != self._new_target:
-            self._new_target = wish
+            target = min(offered * self.greedy, self.max_current)
+        if target != self._new_target:
+            self._new_target = target
             self._new_target_at = now
         if now - self._new_target_at >= self.reaction:
             self._target = self._new_target

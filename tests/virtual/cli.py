@@ -60,9 +60,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: over.set())
     with bus:
-        _say(f"ready {options.protocol} {bus.url}")
+        _print(f"ready {options.protocol} {bus.url}")
         if options.control:
-            control = Control(bus, _say)
+            control = Control(bus, _print)
             threading.Thread(
                 target=_read_commands, args=(control,), daemon=True
             ).start()
@@ -81,7 +81,7 @@ def _run(bus: VirtualBus, options: argparse.Namespace, over: threading.Event) ->
             return
         over.wait(min(left, STATUS_INTERVAL))
         if options.verbose and not over.is_set():
-            _say(bus.call(lambda: describe(bus)))
+            _print(bus.call(lambda: describe(bus)))
 
 
 def _read_commands(control: Control) -> None:
@@ -89,7 +89,7 @@ def _read_commands(control: Control) -> None:
         control.do(text)
 
 
-def _say(text: str) -> None:
+def _print(text: str) -> None:
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
 

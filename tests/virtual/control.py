@@ -28,10 +28,10 @@ HELP = (
 class Control:
     """Executes lines of text; replies `ok`, a status, or `error ...`."""
 
-    def __init__(self, bus: VirtualBus, say: Callable[[str], None]) -> None:
-        """Control this bus; replies go to `say`."""
+    def __init__(self, bus: VirtualBus, reply: Callable[[str], None]) -> None:
+        """Control this bus; replies go to `reply`."""
         self._bus = bus
-        self._say = say
+        self._reply = reply
 
     def do(self, text: str) -> None:
         """Execute one line."""
@@ -39,9 +39,9 @@ class Control:
         if not words:
             return
         try:
-            self._say(self._do(words[0], words[1:]))
+            self._reply(self._do(words[0], words[1:]))
         except (IndexError, KeyError, TypeError, ValueError) as error:
-            self._say(f"error {text.strip()}: {error}")
+            self._reply(f"error {text.strip()}: {error}")
 
     def _do(self, word: str, values: list[str]) -> str:
         bus = self._bus

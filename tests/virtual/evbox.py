@@ -11,8 +11,8 @@ from .evbox_frames import (
     SILENCE_TOLERANCE,
     SMARTGRID,
     FrameFinder,
-    Heard,
     Order,
+    ReceivedFrame,
     checked,
     frame,
     order,
@@ -88,7 +88,7 @@ class _Standing:
     fallback: Three
     timeout: float
     since: float
-    heard_at: float = field(default=float("-inf"))
+    received_at: float = field(default=float("-inf"))
 
 
 class EvboxChargePoint(Device):
@@ -217,8 +217,8 @@ class EvboxChargePoint(Device):
 
     def receive(self, segment: Segment) -> None:
         """Receive bytes; reply to a request addressed to this box."""
-        for heard in self._finder.feed(segment):
-            self._heard(heard)
+        for received in self._finder.feed(segment):
+            self._receive_frame(received)
 
     def step(self) -> None:
         """Time out, share the limit among the modules, advance the cars."""
@@ -234,16 +234,16 @@ class EvboxChargePoint(Device):
             self.counters.fail_backs += 1
         self._step_modules(now)
 
-    def _heard(self, heard: Heard) -> None:
-        body = checked(heard.text)
+    def _receive_frame(self, received: ReceivedFrame) -> None:
+        body = checked(received.text)
         if body is None:
-            if heard.source == CLIENT:
+            if received.source == CLIENT:
                 self.counters.bad_checksum += 1
             return
         if body[:2] != CHARGEPOINT:
             self.counters.for_others += 1
             return
-        request = order(body, heard.end)
+        request = order(body, received.end)
         if request is None:
             self.counters.malformed += 1
             return
@@ -253,10 +253,10 @@ class EvboxChargePoint(Device):
             self.counters.for_others += 1
             return
         self.requests += 1
-        if heard.silence < SILENCE - SILENCE_TOLERANCE and heard.source == CLIENT:
+        if received.silence < SILENCE - SILENCE_TOLERANCE and received.source == CLIENT:
             self.counters.silence_violations += 1
-        last = self._standing.heard_at if self._standing else float("-inf")
-        if heard.end - last < self.min_interval - INTERVAL_TOLERANCE:
+        last = self._standing.received_at if self._standing else float("-inf")
+        if received.end - last < self.min_interval - INTERVAL_TOLERANCE:
             self.counters.too_soon += 1
             return
         self._accept(request)

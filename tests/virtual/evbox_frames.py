@@ -48,7 +48,7 @@ def frame(text: str) -> bytes:
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class ReceivedFrame:
     """A text between STX and ETX, with the silence before its STX, and its sender."""
 
     text: str
@@ -85,10 +85,10 @@ class FrameFinder:
         self._start = 0.0
         self.restarts = 0
 
-    def feed(self, segment: Segment) -> list[Heard]:
+    def feed(self, segment: Segment) -> list[ReceivedFrame]:
         """Return the frames that this segment completes."""
         data = segment.data
-        result: list[Heard] = []
+        result: list[ReceivedFrame] = []
         if not self._inside and STX not in data:
             return result
         for index, byte in enumerate(data):
@@ -105,7 +105,7 @@ class FrameFinder:
                 if HEX.issuperset(self._chars):
                     end = segment.start + (index + 1) * segment.byte_time
                     result.append(
-                        Heard(
+                        ReceivedFrame(
                             self._chars.decode("ascii"),
                             self._silence,
                             self._start,

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 COMMAND_TIMEOUT = 30.0
 SERVER_TIMEOUT = 600.0
 POWER_BACKUP_TIME = 260.0
-POWER_UP_CLOCK = datetime(2000, 1, 1)  # noqa: DTZ001 - the box knows no zone
+POWER_UP_CLOCK = datetime(2000, 1, 1)  # noqa: DTZ001 - the box has no zone
 # Change bits: bit 2 is car 1, bit 1 car 2, bit 0 the card.
 CAR_BITS = (0b100, 0b010)
 
@@ -144,7 +144,7 @@ class EwsBox(EwsInteraction):
         self._bits = 0
         self._keys: dict[int, int] = {}
         self._clock = (0.0, POWER_UP_CLOCK)
-        self._heard_at = 0.0
+        self._received_at = 0.0
         self._timed_out_at: dict[int, float] = {}
         self.take_parameters()
 
@@ -175,7 +175,7 @@ class EwsBox(EwsInteraction):
     @property
     def silent_for(self) -> float:
         """Return the time since the last command, s."""
-        return self.now() - self._heard_at
+        return self.now() - self._received_at
 
     @property
     def card_counts_as_valid(self) -> bool:
@@ -288,16 +288,16 @@ class EwsBox(EwsInteraction):
 
     def _command(self, message: Message) -> None:
         self.requests += 1
-        self._heard_at = self.now()
+        self._received_at = self.now()
         self.step()
         handler = COMMANDS.get(message.name)
         answer = None
         if handler is not None and message.name not in self.unanswered:
             answer = handler(self, message.data)
-        heard = EwsCommand(message.t, self.now(), message.name, message.data, answer)
-        self.commands.append(heard)
+        received = EwsCommand(message.t, self.now(), message.name, message.data, answer)
+        self.commands.append(received)
         if message.name in WRITING:
-            self.writes.append(heard)
+            self.writes.append(received)
         if answer is not None:
             self._answer(message.parameters[:2] + answer)
         self.step()
@@ -361,7 +361,7 @@ class EwsBox(EwsInteraction):
             return
         for port in self.ports:
             started = port.history.starts[-1][0] if port.history.starts else 0.0
-            since = max(self._heard_at, started)
+            since = max(self._received_at, started)
             if now - since < SERVER_TIMEOUT:
                 continue
             if self._timed_out_at.get(port.number) != since:
@@ -385,7 +385,7 @@ class EwsBox(EwsInteraction):
         self.powered = True
         self.restarted = True
         self.restarts += 1
-        self._heard_at = now
+        self._received_at = now
         if not self.clock_survives:
             self._clock = (now, POWER_UP_CLOCK)
         self.initialise()

@@ -80,8 +80,8 @@ class SmartEvse(Device):
         self.turn_round = turn_round
         self.jitter = jitter
         self.unasked = 0
-        self._heard = bytearray()
-        self._heard_until = float("-inf")
+        self._received = bytearray()
+        self._received_until = float("-inf")
         self._frame_timer: asyncio.TimerHandle | None = None
 
     # For tests: state
@@ -238,10 +238,10 @@ class SmartEvse(Device):
         if self._frame_timer is not None:
             self._frame_timer.cancel()
             self._frame_timer = None
-        if self._heard and segment.start - self._heard_until > FRAME_GAP:
+        if self._received and segment.start - self._received_until > FRAME_GAP:
             self._take_frame()
-        self._heard += segment.data
-        self._heard_until = segment.end
+        self._received += segment.data
+        self._received_until = segment.end
         self._frame_timer = bus.loop.call_at(
             segment.end + FRAME_GAP + EPSILON, self._frame_over
         )
@@ -253,12 +253,12 @@ class SmartEvse(Device):
             return
         # Bytes arrive in whole runs: a run that has begun meanwhile belongs to this
         # frame if it began in time.
-        if not bus.wire.begun_before(self._heard_until + FRAME_GAP, self.name):
+        if not bus.wire.begun_before(self._received_until + FRAME_GAP, self.name):
             self._take_frame()
 
     def _take_frame(self) -> None:
-        data, self._heard = bytes(self._heard[: LONGEST + 1]), bytearray()
-        ended = self._heard_until
+        data, self._received = bytes(self._received[: LONGEST + 1]), bytearray()
+        ended = self._received_until
         answer = self.controller.receive(data, self.now())
         self._speak()
         if answer is None or self.bus is None:

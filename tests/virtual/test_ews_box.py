@@ -63,8 +63,8 @@ def test_bcc_without_the_message_id() -> None:
         client.write(command("id"))
         assert client.next(0.1) is None
         assert box.frames.counters.bad_bcc == 1
-        heard = ews_commands_in(bus.log.of(CLIENT), "without_msgid")
-        assert [m.name for m in heard] == ["id"]
+        received = ews_commands_in(bus.log.of(CLIENT), "without_msgid")
+        assert [m.name for m in received] == ["id"]
 
 
 def test_other_messages_are_ignored() -> None:
@@ -157,8 +157,8 @@ def test_a_limit() -> None:
         box.ignores_limits = True
         assert client.limit(1, 6) == 0
         assert box.ports[0].limit == 16
-    told = [(limit.port, limit.amps, limit.accepted) for limit in box.currents_set]
-    assert told[:3] == [(1, 6, True), (1, 16, True), (1, 17, False)]
+    limits = [(limit.port, limit.amps, limit.accepted) for limit in box.currents_set]
+    assert limits[:3] == [(1, 6, True), (1, 16, True), (1, 17, False)]
 
 
 def test_a_limit_is_lost_with_the_power_and_the_charge_may_come_back() -> None:

@@ -73,8 +73,8 @@ def test_the_box_dials_and_answers(server: socket.socket) -> None:
         assert box.server_connected
         assert dialler.connected
         assert dialler.opened == dialler.attempts == 1
-        heard = ews_commands_in(dialler.log.of(CLIENT))
-        assert [m.name for m in heard] == [*SIZES, "rs"]
+        received = ews_commands_in(dialler.log.of(CLIENT))
+        assert [m.name for m in received] == [*SIZES, "rs"]
         assert client.ask("rp")[13] == 0b00001
         assert not dialler.dropped
 

@@ -13,7 +13,7 @@ ID = bytes.fromhex("02 0002 43 6964 4C")
 ID_WITHOUT = bytes.fromhex("02 0002 43 6964 0F")
 
 
-def heard(data: bytes, start: float = 0.0) -> Segment:
+def segment(data: bytes, start: float = 0.0) -> Segment:
     return Segment(start, 0.0001, data, ("client",), 0.0)
 
 
@@ -30,41 +30,41 @@ def test_bcc_counts_length_id_and_parameters() -> None:
 
 def test_only_a_correct_bcc_is_accepted() -> None:
     reader = FrameReader()
-    assert not reader.feed(heard(ID_WITHOUT))
+    assert not reader.feed(segment(ID_WITHOUT))
     assert reader.counters.bad_bcc == 1
     reader.bcc = "without_msgid"
-    assert [m.name for m in reader.feed(heard(ID_WITHOUT))] == ["id"]
+    assert [m.name for m in reader.feed(segment(ID_WITHOUT))] == ["id"]
 
 
 def test_frames_cut_anywhere() -> None:
     stream = ID + command("sl", b"\x01\x03")
     for cut in range(len(stream)):
         reader = FrameReader()
-        first = reader.feed(heard(stream[:cut]))
-        rest = reader.feed(heard(stream[cut:], 0.05))
+        first = reader.feed(segment(stream[:cut]))
+        rest = reader.feed(segment(stream[cut:], 0.05))
         assert [m.name for m in first + rest] == ["id", "sl"]
 
 
 def test_a_pause_inside_a_frame_drops_it() -> None:
     reader = FrameReader(timeout=0.1)
-    reader.feed(heard(ID[:4]))
-    assert [m.name for m in reader.feed(heard(ID, 0.2))] == ["id"]
+    reader.feed(segment(ID[:4]))
+    assert [m.name for m in reader.feed(segment(ID, 0.2))] == ["id"]
     assert reader.counters.timeouts == 1
 
 
 def test_characters_that_wake_are_skipped() -> None:
     reader = FrameReader()
-    assert len(reader.feed(heard(b"\x00\xff\x03" + ID + b"UU"))) == 1
+    assert len(reader.feed(segment(b"\x00\xff\x03" + ID + b"UU"))) == 1
     assert reader.counters.skipped_bytes == 5
 
 
 def test_longer_than_allowed_is_dropped() -> None:
     reader = FrameReader()
-    assert len(reader.feed(heard(frame(b"C", bytes(1040))))) == 1
+    assert len(reader.feed(segment(frame(b"C", bytes(1040))))) == 1
     # The bytes after the length are noise now, and have no STX.
-    assert not reader.feed(heard(frame(b"C", b"\x01" * 1041)))
+    assert not reader.feed(segment(frame(b"C", b"\x01" * 1041)))
     assert reader.counters.too_long == 1
-    assert [m.name for m in reader.feed(heard(ID))] == ["id"]
+    assert [m.name for m in reader.feed(segment(ID))] == ["id"]
 
 
 def test_noise_never_raises() -> None:
@@ -72,9 +72,9 @@ def test_noise_never_raises() -> None:
     reader = FrameReader()
     for round_number in range(300):
         data = dice.randbytes(dice.randrange(60))
-        reader.feed(heard(data, float(round_number)))
+        reader.feed(segment(data, float(round_number)))
     reader.reset()
-    assert [m.name for m in reader.feed(heard(ID, 1000.0))] == ["id"]
+    assert [m.name for m in reader.feed(segment(ID, 1000.0))] == ["id"]
 
 
 def test_messages_in_a_log() -> None:

@@ -77,8 +77,10 @@ def test_replies_are_no_requests() -> None:
         packet = decode(data, V2_17.functions)
         assert packet is not None
         assert packet.kind == "answer"
-    heard = [Entry(0.0, 0.1, "client", data, data, collided=False) for data in answers]
-    assert smartevse_requests_in(heard) == []
+    entries = [
+        Entry(0.0, 0.1, "client", data, data, collided=False) for data in answers
+    ]
+    assert smartevse_requests_in(entries) == []
 
 
 @pytest.mark.parametrize("dialect", DIALECTS.values(), ids=lambda d: d.name)

@@ -313,8 +313,8 @@ def test_two_slaves_and_their_master_on_the_wire() -> None:
         cars[1].plug_in()
         bus.wait_for(lambda: all(slave.contactor for slave in slaves), 8)
         bus.wait_for(lambda: [s.pilot_current for s in slaves] == [10.0, 10.0])
-        said = smartevse_requests_in(bus.log.bursts(master.name))
-        broadcasts = [request for request in said if request.unit == 0]
+        sent = smartevse_requests_in(bus.log.bursts(master.name))
+        broadcasts = [request for request in sent if request.unit == 0]
         assert {request.register for request in broadcasts} == {1}
         assert all(sum(request.values) <= 200 for request in broadcasts)
         gaps = [b.t - a.t for a, b in itertools.pairwise(broadcasts)]
@@ -331,8 +331,8 @@ def test_another_master_of_a_later_dialect() -> None:
     with living(VirtualBus.in_loop(SmartEvse("later", load_balance=1))) as bus:
         bus.advance(2)
         bus.wait_for(lambda: len(bus.log) > 0)
-        heard = smartevse_requests_in(bus.log.entries)[0]
-        assert (heard.unit, heard.register, heard.count) == (9, 0x20, 8)
+        request = smartevse_requests_in(bus.log.entries)[0]
+        assert (request.unit, request.register, request.count) == (9, 0x20, 8)
 
 
 def test_a_read_of_another_unit_is_ignored() -> None:

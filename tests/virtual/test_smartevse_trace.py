@@ -59,7 +59,7 @@ class Recording(SmartEvseAlone):
         super().__init__("2.17", load_balance=load_balance)
         self.outlet.pilot_voltage = 12
 
-    def hear_hex(self, request: str) -> str | None:
+    def receive_hex(self, request: str) -> str | None:
         answer = self.receive(bytes.fromhex(request))
         return answer.hex() if answer else None
 
@@ -67,7 +67,7 @@ class Recording(SmartEvseAlone):
     def sent_hex(self) -> list[tuple[float, str]]:
         return [(t, data.hex()) for t, data in self.sent]
 
-    def heard_alone(self, seconds: float) -> list[tuple[float, str]]:
+    def sent_alone(self, seconds: float) -> list[tuple[float, str]]:
         """Return the frames sent within a time, with times from its beginning."""
         begin, before = self.now, len(self.sent)
         self.live(seconds)
@@ -104,12 +104,12 @@ def replay(record: Recording, entries: list[dict[str, Any]]) -> Iterator[str]:
                 what, record.outlet.pilot_voltage
             )
             want = frames_of([(t, data) for t, data in entry["unsolicited"]])
-            assert_alike(record.heard_alone(LISTENED[what]), want, 0.05)
+            assert_alike(record.sent_alone(LISTENED[what]), want, 0.05)
         else:
             pilot, seconds = BEFORE_NORMAL.get(what, (None, 0.0))
             record.outlet.pilot_voltage = pilot or record.outlet.pilot_voltage
             record.live(seconds)
-            assert record.hear_hex(entry["request"]) == entry["reply"], what
+            assert record.receive_hex(entry["request"]) == entry["reply"], what
             record.live(EXCHANGE)
         yield what
 
@@ -149,7 +149,7 @@ def test_slave_with_master() -> None:
         if entry.get("event") in pilots:
             record.outlet.pilot_voltage = pilots[entry["event"]]
         elif entry.get("dir") == "master":
-            answer = record.hear_hex(entry["hex"])
+            answer = record.receive_hex(entry["hex"])
             if answer:
                 answers.append((record.now, answer))
     record.live(1.0)
@@ -188,7 +188,7 @@ def test_slave_stop_and_resume() -> None:
         while next_broadcast <= end:
             record.live(max(0.0, next_broadcast - record.now))
             broadcast = write_several_frame(0, 1, 0, limit, 0, 0)
-            assert record.hear_hex(broadcast.hex()) is None
+            assert record.receive_hex(broadcast.hex()) is None
             next_broadcast += 2.0
         record.live(max(0.0, end - record.now))
 
@@ -204,9 +204,9 @@ def test_slave_stop_and_resume() -> None:
             assert [frame for _, frame in record.sent_hex] == [entry["slave_sent"]]
             record.sent.clear()
         elif "master_ack" in entry:
-            assert record.hear_hex(entry["master_ack"]) is None
+            assert record.receive_hex(entry["master_ack"]) is None
         else:
-            assert record.hear_hex(entry["request"]) == entry["reply"], what
+            assert record.receive_hex(entry["request"]) == entry["reply"], what
             live(EXCHANGE)
     assert record.sent == []
     assert done >= set(BEFORE_RESUME)

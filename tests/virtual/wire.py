@@ -34,7 +34,7 @@ class Transmission:
     start: float
     byte_time: float
     position: int = 0
-    heard: bytearray = field(default_factory=bytearray)
+    received: bytearray = field(default_factory=bytearray)
     collided: bool = False
 
     @property
@@ -125,8 +125,8 @@ class Wire:
 
         A byte is received at its end: a sender that begins before that collides.
         """
-        heard = [t.end for t in self._active if t.start + t.byte_time <= now]
-        return max([self._last_end, *heard])
+        detected = [t.end for t in self._active if t.start + t.byte_time <= now]
+        return max([self._last_end, *detected])
 
     @property
     def last_end(self) -> float:
@@ -233,8 +233,8 @@ class Wire:
             data = first.data[first.position : first.position + complete]
             first.position += complete
             data = self.faults.disturb(data, self._rng)
-            first.heard += data
-            self._hear(start, data, (first.source,))
+            first.received += data
+            self._receive(start, data, (first.source,))
             return True
         self._collide(first, others, start)
         return True
@@ -255,14 +255,14 @@ class Wire:
                 together.append(other)
         for transmission in together:
             transmission.position += 1
-            transmission.heard.append(value)
+            transmission.received.append(value)
             if not transmission.collided:
                 transmission.collided = True
                 self.collisions += 1
         sources = tuple(sorted({t.source for t in together}))
-        self._hear(start, bytes((value,)), sources)
+        self._receive(start, bytes((value,)), sources)
 
-    def _hear(self, start: float, data: bytes, sources: tuple[str, ...]) -> None:
+    def _receive(self, start: float, data: bytes, sources: tuple[str, ...]) -> None:
         silence = start - self._last_end
         # On two wires the other direction may already be further.
         self._last_end = max(self._last_end, start + len(data) * self.byte_time)
@@ -284,7 +284,7 @@ class Wire:
                 transmission.end,
                 transmission.source,
                 transmission.data,
-                bytes(transmission.heard),
+                bytes(transmission.received),
                 transmission.collided,
             )
         )

@@ -10,7 +10,7 @@ EVERY: Final = 5.0
 """Seconds between two lines of progress if lines cannot be overwritten."""
 
 
-def say(text: str = "") -> None:
+def report(text: str = "") -> None:
     """Print a line."""
     sys.stdout.write(f"demo: {text}\n" if text else "\n")
     sys.stdout.flush()
@@ -33,7 +33,7 @@ class Progress:
         if self._live:
             self.show()
         else:
-            say(f"{self._title} ...")
+            report(f"{self._title} ...")
         return self
 
     def __exit__(self, kind: object, *_: object) -> None:
@@ -41,7 +41,7 @@ class Progress:
         if self._live:
             sys.stdout.write("\r" + " " * WIDTH + "\r")
         if kind is None:
-            say(f"{self._title}: {self.outcome} ({self.seconds:.0f} s)")
+            report(f"{self._title}: {self.outcome} ({self.seconds:.0f} s)")
 
     @property
     def seconds(self) -> float:
@@ -59,4 +59,4 @@ class Progress:
             sys.stdout.flush()
         elif now - self._printed_at >= EVERY:
             self._printed_at = now
-            say(text)
+            report(text)
