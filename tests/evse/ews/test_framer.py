@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from hypothesis import assume, given, strategies as st
 import pytest
 
+from custom_components.evse_bus.evse.ews.wire import frames as module
 from custom_components.evse_bus.evse.ews.wire.frames import (
     LONGEST_FRAME,
     Bcc,
@@ -331,3 +332,51 @@ def test_no_repr_shows_contents() -> None:
     (frame,), _ = feed(answer("ru", b"secret"))
     assert "secret" not in repr(frame)
     assert frame.raw.hex() not in repr(frame)
+
+
+HOSTILE = [
+    bytes.fromhex("02000b49696600"),
+    b"\x02\x04\x10Arc",
+    b"\x02\x00\x0bIif",
+    b"\x02",
+    b"\x02\x00\x02Cid",
+]
+"""Patterns in which each message begun seems to hold another one."""
+
+
+@pytest.mark.parametrize("pattern", HOSTILE, ids=bytes.hex)
+@pytest.mark.parametrize("size", [1, 7, 4096])
+def test_what_is_kept_is_bounded(pattern: bytes, size: int) -> None:
+    """The first of them was kept whole, and searched again with each byte."""
+    framer = EwsFramer()
+    data = pattern * (3000 // len(pattern))
+    for at in range(0, len(data), size):
+        framer.feed(data[at : at + size])
+        assert framer.pending <= LONGEST_FRAME + 16
+    good = message("C", b"id")
+    framer.feed(bytes(2 * LONGEST_FRAME))
+    assert [frame.raw for frame in framer.feed(good)] == [good]
+
+
+@pytest.mark.parametrize("pattern", HOSTILE[:2], ids=bytes.hex)
+def test_a_long_run_of_garbage_costs_as_much_per_byte(
+    pattern: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Counted in looks at a head, not in seconds."""
+    looks = 0
+    length = module._length
+
+    def counted(head: bytes) -> int | None:
+        nonlocal looks
+        looks += 1
+        return length(head)
+
+    monkeypatch.setattr(module, "_length", counted)
+    counts = []
+    for size in (1200, 1500, 1800):
+        framer, looks = EwsFramer(), 0
+        for byte in (pattern * size)[:size]:
+            framer.feed(bytes((byte,)))
+        counts.append(looks)
+    # The same for each further piece, but for the beginning.
+    assert counts[2] - counts[1] <= 1.2 * (counts[1] - counts[0])

@@ -5,6 +5,7 @@ is that of the parameters alone. The parameters of a command, of its answer and 
 info record begin with its name, two letters (manual, 3.2.2, 3.2.3).
 """
 
+from bisect import bisect_right
 from dataclasses import dataclass, field
 from enum import Enum, IntEnum, StrEnum
 from typing import ClassVar, Final, override
@@ -163,7 +164,7 @@ def redacted(raw: bytes) -> bytes:
     A known message that is not private is kept whole; of a private one the head with
     its name is kept; of anything else only the length.
     """
-    if _whole(raw, 0) != raw or raw[3] not in _NAMED:
+    if _Scan(raw, {}).whole(0) != raw or raw[3] not in _NAMED:
         return bytes(len(raw))
     head = raw[:_HEAD]
     return head + bytes(len(raw) - _HEAD) if head[4:] in _PRIVATE_NAMES else raw
@@ -176,6 +177,8 @@ _INFO_LENGTH: Final = 16
 """Bytes of an info record (3.2.3), which may come at any moment."""
 _SURE: Final = 4
 """So many bytes of its head do not occur in another message by chance."""
+_LONGEST_KEPT: Final = LONGEST_FRAME + _INFO_LENGTH
+"""The longest message with the beginning of an info record inside it, bytes."""
 
 
 class EwsFramer(Framer[EwsFrame]):
@@ -184,6 +187,10 @@ class EwsFramer(Framer[EwsFrame]):
     An incomplete message is kept, but not at the cost of others: an info record inside
     it is taken out, and an answer or a command inside it shows that it will never be
     completed. Debug messages and those of applications are skipped whole.
+
+    Memory and time per byte are bounded, whatever comes: a message is given up when it
+    is longer than any, and the kept bytes are searched again only when a message among
+    them may be complete.
     """
 
     unsolicited: ClassVar = True
@@ -192,6 +199,10 @@ class EwsFramer(Framer[EwsFrame]):
         """Start empty."""
         super().__init__()
         self._buffer = b""
+        self._search_at = 0
+        """Length of the buffer from which on a search may find something new."""
+        self._checksums: dict[int, Bcc | None] = {}
+        """Kinds of checksum of complete messages, by their place in the buffer."""
 
     @property
     @override
@@ -201,7 +212,7 @@ class EwsFramer(Framer[EwsFrame]):
     @override
     def reset(self) -> None:
         self.noise += len(self._buffer)
-        self._buffer = b""
+        self._drop(len(self._buffer))
 
     @override
     def redacted(self, raw: bytes) -> bytes:
@@ -209,18 +220,29 @@ class EwsFramer(Framer[EwsFrame]):
 
     @override
     def feed(self, data: bytes) -> list[EwsFrame]:
-        buffer = self._buffer + data
+        found: list[EwsFrame] = []
+        for at in range(0, len(data), LONGEST_FRAME):
+            received = len(self._buffer)
+            self._buffer += data[at : at + LONGEST_FRAME]
+            if (begins := self._buffer.find(STX_BYTE, received)) >= 0:
+                self._search_at = min(self._search_at, begins + _HEAD - 2)
+            if len(self._buffer) >= self._search_at:
+                found += self._search()
+        return found
+
+    def _search(self) -> list[EwsFrame]:
+        scan = _Scan(self._buffer, self._checksums)
         found: list[EwsFrame] = []
         taken = at = 0
         begun: int | None = None
-        while (at := buffer.find(STX_BYTE, at)) >= 0:
-            whole = _whole(buffer, at)
+        while (at := scan.buffer.find(STX_BYTE, at)) >= 0:
+            whole = scan.whole(at)
             if whole is None:
                 if begun is None:
-                    if _may_end(buffer, at):
+                    if scan.may_end(at):
                         begun = at
                     else:
-                        self.bad += _length(buffer[at : at + _HEAD]) is not None
+                        self.bad += _length(scan.buffer[at : at + _HEAD]) is not None
                 at += 1
                 continue
             frame = _frame(whole)
@@ -230,7 +252,8 @@ class EwsFramer(Framer[EwsFrame]):
                     continue
                 if frame.message_id is MessageId.INFO:
                     found.append(frame)
-                    buffer = buffer[:at] + buffer[at + len(whole) :]
+                    rest = scan.buffer[:at] + scan.buffer[at + len(whole) :]
+                    scan = _Scan(rest, {})
                     at, begun = begun, None
                     continue
                 self.bad += 1
@@ -239,14 +262,112 @@ class EwsFramer(Framer[EwsFrame]):
                 found.append(frame)
             self.noise += at - taken
             taken = at = at + len(whole)
-        kept = len(buffer) if begun is None else begun
+        kept = len(scan.buffer) if begun is None else begun
         self.noise += kept - taken
-        self._buffer = buffer[kept:]
+        self._buffer = scan.buffer
+        self._checksums = scan.checksums
+        self._search_at = 0 if begun is None else scan.changes_at(kept)
+        self._drop(kept)
         return found
+
+    def _drop(self, length: int) -> None:
+        """Drop bytes from the front of the buffer."""
+        self._buffer = self._buffer[length:]
+        self._search_at = max(self._search_at - length, 0)
+        self._checksums = {
+            at - length: bcc for at, bcc in self._checksums.items() if at >= length
+        }
 
 
 _TRUSTED_INSIDE: Final = frozenset({"if", *CommandId})
 """Names that are accepted inside a possible other message."""
+
+
+class _Scan:
+    """One search through the kept bytes."""
+
+    def __init__(self, buffer: bytes, checksums: dict[int, Bcc | None]) -> None:
+        """``checksums`` are those that earlier searches have computed."""
+        self.buffer = buffer
+        self.checksums = checksums
+        self._records = self._find_records()
+        """Where good or incomplete info records begin, ascending."""
+        self._partial = [
+            len(buffer) - length
+            for length in range(_HEAD - 1, 0, -1)
+            if buffer.endswith(_INFO_HEAD[:length])
+        ]
+        """Where the head of an info record may begin at the end, ascending."""
+
+    def whole(self, at: int) -> bytes | None:
+        """Return the good message that begins here, if it is complete."""
+        length = _length(self.buffer[at : at + _HEAD])
+        if length is None or length > min(LONGEST_FRAME, len(self.buffer) - at):
+            return None
+        # With an info record inside, its checksum is right by chance only.
+        if self._bcc(at, length) is None or self._record_inside(at, length, _SURE):
+            return None
+        return self.buffer[at : at + length]
+
+    def may_end(self, at: int) -> bool:
+        """Return whether a good message may begin here."""
+        length = _length(self.buffer[at : at + _HEAD])
+        received = len(self.buffer) - at
+        if length is not None and received < length <= LONGEST_FRAME:
+            return True
+        if received > _LONGEST_KEPT:
+            return False
+        # It seems broken, but may be good except for an info record inside it.
+        inside = _HEAD if length is None else min(length, LONGEST_FRAME)
+        return self._record_inside(at, inside, 1)
+
+    def changes_at(self, start: int) -> int:
+        """Return the length of the buffer at which a next search may differ.
+
+        ``start``: the bytes before it are dropped.
+        """
+        length = len(self.buffer)
+        if self._partial and self._partial[-1] >= start:
+            return length + 1
+        nearest = start + _LONGEST_KEPT + 1
+        at = start
+        while (at := self.buffer.find(STX_BYTE, at)) >= 0:
+            whole = _length(self.buffer[at : at + _HEAD])
+            if whole is not None:
+                # The message-id, then each letter of the name, may rule a head out.
+                for end in (at + 4, at + 5, at + _HEAD, at + whole):
+                    if length < end < nearest:
+                        nearest = end
+            at += 1
+        return nearest
+
+    def _bcc(self, at: int, length: int) -> Bcc | None:
+        if at not in self.checksums:
+            self.checksums[at] = _bcc(self.buffer[at : at + length])
+        return self.checksums[at]
+
+    def _find_records(self) -> list[int]:
+        found: list[int] = []
+        at = -1
+        while (at := self.buffer.find(_INFO_HEAD, at + 1)) >= 0:
+            incomplete = len(self.buffer) - at < _INFO_LENGTH
+            if incomplete or self._bcc(at, _INFO_LENGTH) is not None:
+                found.append(at)
+        return found
+
+    def _record_inside(self, at: int, length: int, least: int) -> bool:
+        """Return whether a good info record begins inside a message.
+
+        ``least``: the bytes of it that must have been received.
+        """
+        end = at + length
+        first = bisect_right(self._records, at)
+        if first < len(self._records) and self._records[first] < end:
+            return True
+        received = len(self.buffer)
+        return any(
+            at < inside < end and received - inside >= least for inside in self._partial
+        )
 
 
 def _length(head: bytes) -> int | None:
@@ -265,18 +386,6 @@ def _length(head: bytes) -> int | None:
     elif message_id != MessageId.DEBUG and message_id < _APPLICATION:
         return None
     return int.from_bytes(head[1:3]) + _EXTRA
-
-
-def _whole(buffer: bytes, at: int) -> bytes | None:
-    """Return the good message that begins here, if it is complete."""
-    length = _length(buffer[at : at + _HEAD])
-    if length is None or length > min(LONGEST_FRAME, len(buffer) - at):
-        return None
-    raw = buffer[at : at + length]
-    # With an info record inside, its checksum is right by chance only.
-    if _bcc(raw) is None or _record_inside(buffer, at, at + length, _SURE):
-        return None
-    return raw
 
 
 def _bcc(raw: bytes) -> Bcc | None:
@@ -299,30 +408,4 @@ def _frame(raw: bytes) -> EwsFrame | None:
         name=raw[4:_HEAD].decode("ascii"),
         data=raw[_HEAD:-1],
         bcc=bcc,
-    )
-
-
-def _may_end(buffer: bytes, at: int) -> bool:
-    """Return whether a good message may begin here."""
-    length = _length(buffer[at : at + _HEAD])
-    if length is not None and len(buffer) - at < length <= LONGEST_FRAME:
-        return True
-    # It seems broken, but may be good except for an info record inside it.
-    end = at + (_HEAD if length is None else min(length, LONGEST_FRAME))
-    return _record_inside(buffer, at, end, 1)
-
-
-def _record_inside(buffer: bytes, at: int, end: int, least: int) -> bool:
-    """Return whether a good info record begins inside a message.
-
-    ``least``: the bytes of it that must have been received.
-    """
-    inside = at
-    while (inside := buffer.find(_INFO_HEAD, inside + 1, end + _HEAD - 1)) >= 0:
-        record = buffer[inside : inside + _INFO_LENGTH]
-        if len(record) < _INFO_LENGTH or _bcc(record) is not None:
-            return True
-    return any(
-        at < len(buffer) - come < end and buffer.endswith(_INFO_HEAD[:come])
-        for come in range(least, _HEAD)
     )
