@@ -373,7 +373,7 @@ def test_a_long_run_of_garbage_costs_as_much_per_byte(
 
     monkeypatch.setattr(module, "_length", counted)
     counts = []
-    for size in (1200, 1500, 1800):
+    for size in (2 * LONGEST_FRAME, 3 * LONGEST_FRAME, 4 * LONGEST_FRAME):
         framer, looks = EwsFramer(), 0
         for byte in (pattern * size)[:size]:
             framer.feed(bytes((byte,)))
