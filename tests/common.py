@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from copy import deepcopy
+from functools import partial
 from typing import Any
 
 from homeassistant.config_entries import (
@@ -24,10 +25,20 @@ from homeassistant.helpers.event import async_track_state_change_event
 from pytest_homeassistant_custom_component.common import MockConfigEntry
 
 from custom_components.evse_bus.const import DOMAIN, SUBENTRY_CHARGER
+from custom_components.evse_bus.issues import report_orders_written
+from custom_components.evse_bus.orders import (
+    KNOWN_KEY,
+    ORDERS,
+    ORDERS_KEY,
+    OrderStore,
+    Record,
+    encode,
+)
 from tests.virtual import AblBox, EvboxChargePoint, SmartEvse, VirtualBus
 from tests.virtual.device import Device
 from tests.virtual.ews_box import EwsBox
 
+FILES = (ORDERS_KEY, KNOWN_KEY)
 PATIENCE = 15.0
 """Longest time a virtual charger may take to be seen, s."""
 
@@ -165,11 +176,46 @@ async def crash(
     hass: HomeAssistant, entry: MockConfigEntry, storage: dict[str, Any]
 ) -> None:
     """End a bus as a killed process does: nothing more is sent or written."""
-    key = f"{DOMAIN}.{entry.entry_id}"
-    on_disk = deepcopy(storage.get(key))
+    on_disk = {key: deepcopy(storage[key]) for key in FILES if key in storage}
+    await shut_down(hass, entry)
+    for key in FILES:
+        storage.pop(key, None)
+    storage.update(on_disk)
+
+
+async def shut_down(hass: HomeAssistant, entry: MockConfigEntry) -> None:
+    """End a bus as a clean stop does: the next set-up reads the files anew."""
     await hass.config_entries.async_unload(entry.entry_id)
     await hass.async_block_till_done()
-    storage[key] = on_disk
+    forget_orders(hass)
+
+
+def forget_orders(hass: HomeAssistant) -> None:
+    """Drop all orders from memory, also those that are not written yet."""
+    store = hass.data.get(ORDERS)
+    if store is not None:
+        store._stop_timer()
+        store._pending = False
+    hass.data[ORDERS] = OrderStore(hass, partial(report_orders_written, hass))
+
+
+def stored_order(
+    storage: dict[str, Any], owner: str, port: int | None = None
+) -> dict[str, Any]:
+    """Return the stored record of a charger, by the id of its subentry."""
+    suffix = "" if port is None else f"_{port}"
+    [record] = [
+        record
+        for key, record in storage[ORDERS_KEY]["data"].items()
+        if record.get("owner") == owner and key.endswith(suffix)
+    ]
+    return dict(record)
+
+
+def orders_file(**records: Record[Any]) -> dict[str, Any]:
+    """Return a file of orders; colons in keys are written as two underscores."""
+    data = {key.replace("__", ":"): encode(one) for key, one in records.items()}
+    return {"version": 1, "minor_version": 1, "key": ORDERS_KEY, "data": data}
 
 
 async def call(

@@ -12,7 +12,9 @@ from tests.common import (
     call,
     entity_id,
     get_entity,
+    shut_down,
     state_of,
+    stored_order,
     wait_for_state,
     wait_until,
 )
@@ -186,14 +188,10 @@ async def test_orders_come_back_for_each_port_of_each_box(
                 hass, "number", entry, f"{port}_charging_current", index=index
             )
             await call(hass, "number.set_value", limit, value=amperes)
-        await hass.config_entries.async_unload(entry.entry_id)
-        stored = hass_storage["evse_bus.bus"]["data"]
-        assert {key: value["limit"]["current"] for key, value in stored.items()} == {
-            "ews01_1": 7,
-            "ews01_2": 8,
-            "ews02_1": 9,
-            "ews02_2": 10,
-        }
+        await shut_down(hass, entry)
+        for (index, port), amperes in wanted.items():
+            record = stored_order(hass_storage, f"ews0{index + 1}", port)
+            assert record["limit"]["current"] == amperes
         for dialler, box in ((first, one), (second, two)):
             dialler.call(lambda box=box: [setattr(p, "limit", 0) for p in box.ports])
         await hass.config_entries.async_setup(entry.entry_id)

@@ -8,12 +8,15 @@ from homeassistant.helpers import issue_registry as ir
 import pytest
 
 from custom_components.evse_bus.const import DOMAIN
+from custom_components.evse_bus.orders import ORDERS_KEY
 from tests.common import (
     call,
     crash,
     get_entity,
     running,
+    shut_down,
     state_of,
+    stored_order,
     wait_for_state,
 )
 from tests.ews import (
@@ -27,8 +30,6 @@ from tests.ews import (
     quick_car,
 )
 from tests.virtual import EwsBox
-
-STORE = "evse_bus.bus"
 
 
 async def test_a_crash_in_the_middle_of_a_charge(
@@ -170,16 +171,10 @@ async def test_orders_are_stored_for_each_port(
         await call(hass, "number.set_value", one, value=14)
         await call(hass, "number.set_value", two, value=8)
         await call(hass, "switch.turn_off", off)
-        await hass.config_entries.async_unload(entry.entry_id)
-        stored = hass_storage[STORE]["data"]
-        assert {key: one["limit"]["current"] for key, one in stored.items()} == {
-            "ews01_1": 14,
-            "ews01_2": 8,
-        }
-        assert [stored[key]["allowed"] for key in ("ews01_1", "ews01_2")] == [
-            None,
-            False,
-        ]
+        await shut_down(hass, entry)
+        stored = [stored_order(hass_storage, "ews01", port) for port in (1, 2)]
+        assert [one["limit"]["current"] for one in stored] == [14, 8]
+        assert [one["allowed"] for one in stored] == [None, False]
         bus.call(lambda: [setattr(port, "limit", 0) for port in box.ports])
         await hass.config_entries.async_setup(entry.entry_id)
         await bus.wait_for_async(
@@ -188,7 +183,7 @@ async def test_orders_are_stored_for_each_port(
         await wait_for_state(hass, off, "off")
 
 
-async def test_lost_orders_are_told_and_the_fail_safe_counts(
+async def test_a_port_whose_orders_are_lost_is_stopped(
     hass: HomeAssistant, hass_storage: dict[str, Any]
 ) -> None:
     box = EwsBox()
@@ -197,8 +192,8 @@ async def test_lost_orders_are_told_and_the_fail_safe_counts(
         two = await get_entity(hass, "number", entry, "2_charging_current")
         await call(hass, "number.set_value", one, value=14)
         await call(hass, "number.set_value", two, value=12)
-        await hass.config_entries.async_unload(entry.entry_id)
-        del hass_storage[STORE]["data"]["ews01_2"]
+        await shut_down(hass, entry)
+        del hass_storage[ORDERS_KEY]["data"][f"serial:ews_{box.serial}_2"]
         await hass.config_entries.async_setup(entry.entry_id)
         await bus.wait_for_async(lambda: box.ports[1].limit == 7)
         assert box.ports[0].limit == 14
@@ -207,6 +202,9 @@ async def test_lost_orders_are_told_and_the_fail_safe_counts(
         assert found is not None
         assert found.translation_placeholders == {"charger": "Yard 2", "current": "7"}
         assert issues.async_get_issue(DOMAIN, "orders_lost_ews01_1") is None
+        allowed = await get_entity(hass, "switch", entry, "2_charging_allowed")
         await call(hass, "number.set_value", two, value=10)
+        assert issues.async_get_issue(DOMAIN, "orders_lost_ews01_2") is not None
+        await call(hass, "switch.turn_on", allowed)
         assert issues.async_get_issue(DOMAIN, "orders_lost_ews01_2") is None
         assert state_of(hass, one) == "14.0"

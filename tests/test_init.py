@@ -19,6 +19,7 @@ from homeassistant.helpers import (
 import pytest
 
 from custom_components.evse_bus.const import DOMAIN
+from custom_components.evse_bus.orders import ORDERS_KEY
 from tests.common import (
     bus_entry,
     call,
@@ -28,6 +29,7 @@ from tests.common import (
     running,
     setup_bus,
     state_of,
+    stored_order,
     wait_for_state,
     wait_until,
 )
@@ -167,13 +169,16 @@ async def test_stopping_home_assistant_closes_the_port(hass: HomeAssistant) -> N
 async def test_removal_leaves_nothing(
     hass: HomeAssistant, hass_storage: dict[str, Any]
 ) -> None:
-    with VirtualBus.in_loop(AblBox(1)) as bus:
+    box = AblBox(1)
+    with VirtualBus.in_loop(box) as bus:
         entry = await setup_bus(hass, "abl", bus.url, charger("abl", 1))
         await get_entity(hass, "sensor", entry, "1_status")
-        assert "evse_bus.bus" in hass_storage
+        await hass.async_block_till_done()
+        assert ORDERS_KEY in hass_storage
         await hass.config_entries.async_remove(entry.entry_id)
         await hass.async_block_till_done()
-    assert "evse_bus.bus" not in hass_storage
+    # Its orders stay: it has a serial number, and may return on another bus.
+    assert list(hass_storage[ORDERS_KEY]["data"]) == [f"serial:abl_{box.serial}"]
     assert not er.async_entries_for_config_entry(er.async_get(hass), "bus")
     assert not dr.async_entries_for_config_entry(dr.async_get(hass), "bus")
     assert not ir.async_get(hass).issues
@@ -202,12 +207,11 @@ async def test_a_charger_is_added_and_removed_while_the_others_go_on(
         add_charger(hass, entry, charger_of(two))
         second = await get_entity(hass, "sensor", entry, "1_status", index=1)
         assert state_of(hass, second) == "available"
-        assert "abl2" in hass_storage["evse_bus.bus"]["data"]
+        assert stored_order(hass_storage, "abl2")
 
         hass.config_entries.async_remove_subentry(entry, "abl2")
         await hass.async_block_till_done()
         assert hass.states.get(second) is None
-        assert "abl2" not in hass_storage["evse_bus.bus"]["data"]
         asked = len([r for r in requests_in(bus.log.bursts()) if r.device_id == 2])
         polls = len([r for r in requests_in(bus.log.bursts()) if r.device_id == 1])
         await bus.wait_for_async(

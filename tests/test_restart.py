@@ -17,6 +17,7 @@ import pytest
 from pytest_homeassistant_custom_component.common import async_fire_time_changed
 
 from custom_components.evse_bus.const import DOMAIN
+from custom_components.evse_bus.orders import ORDERS_KEY
 from tests.common import (
     bus_entry,
     call,
@@ -27,6 +28,7 @@ from tests.common import (
     running,
     setup_bus,
     state_of,
+    stored_order,
     wait_for_state,
 )
 from tests.ews import listening
@@ -41,8 +43,6 @@ from tests.virtual import (
     orders_in,
 )
 
-STORE = "evse_bus.bus"
-
 
 async def test_orders_are_read_before_the_port_is_opened(hass: HomeAssistant) -> None:
     read = asyncio.Event()
@@ -50,7 +50,7 @@ async def test_orders_are_read_before_the_port_is_opened(hass: HomeAssistant) ->
     original = Store.async_load
 
     async def slow(self: Store) -> Any:  # noqa: ANN401 - as Store's
-        if self.key == STORE:
+        if self.key == ORDERS_KEY:
             asked.set()
             await read.wait()
         return await original(self)
@@ -123,7 +123,8 @@ async def test_an_abl_box_is_lowered_after_a_crash(
         await call(hass, "number.set_value", limit, value=16)
         assert box.ic_amps > 15
         await crash(hass, entry, hass_storage)
-        hass_storage[STORE]["data"]["abl1"]["limit"]["current"] = 8.0
+        key = f"serial:abl_{box.serial}"
+        hass_storage[ORDERS_KEY]["data"][key]["limit"]["current"] = 8.0
         written = len(box.limits_written)
 
         await hass.config_entries.async_setup(entry.entry_id)
@@ -161,7 +162,7 @@ async def test_a_raise_is_on_disk_after_a_clean_stop(
         limit = await get_entity(hass, "number", entry, "charging_current")
         await call(hass, "number.set_value", limit, value=14)
         await hass.async_stop(force=True)
-        assert hass_storage[STORE]["data"]["abl1"]["limit"]["current"] == 14.0
+        assert stored_order(hass_storage, "abl1")["limit"]["current"] == 14.0
 
 
 async def test_the_adapter_is_plugged_in_after_the_start(

@@ -11,11 +11,17 @@ import pytest
 
 from custom_components.evse_bus import managed_charger
 from custom_components.evse_bus.evse.smartevse import PolledSmartEvse
-from tests.common import call, get_entity, running, state_of, wait_for_state
+from custom_components.evse_bus.orders import ORDERS_KEY
+from tests.common import (
+    call,
+    get_entity,
+    running,
+    state_of,
+    stored_order,
+    wait_for_state,
+)
 from tests.smartevse import ACCESS, access_writes, car, shorten_quiet
 from tests.virtual import SmartEvse
-
-STORE = "evse_bus.bus"
 
 
 async def stop(hass: HomeAssistant) -> None:
@@ -45,7 +51,7 @@ async def test_it_stops_with_home_assistant(
         await call(hass, "switch.turn_on", allowed)
         await wait_for_state(hass, status, "charging")
         await entry.runtime_data.orders.async_flush()
-        orders = hass_storage[STORE]["data"]
+        orders = hass_storage[ORDERS_KEY]["data"]
 
         await hass.async_stop(force=True)
         assert not box.access
@@ -53,8 +59,8 @@ async def test_it_stops_with_home_assistant(
         await bus.wait_for_async(lambda: not box.contactor)
         await bus.wait_for_async(lambda: not bus.connected)
         # What the user wants to stand is not what it was told.
-        assert hass_storage[STORE]["data"] == orders
-        assert orders[f"smartevse{box.unit}"]["allowed"] is True
+        assert hass_storage[ORDERS_KEY]["data"] == orders
+        assert stored_order(hass_storage, f"smartevse{box.unit}")["allowed"] is True
 
 
 async def test_it_stays_off_until_somebody_switches_it_on(hass: HomeAssistant) -> None:

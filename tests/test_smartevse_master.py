@@ -14,13 +14,16 @@ from pytest_homeassistant_custom_component.common import MockConfigEntry
 
 from custom_components.evse_bus.const import DOMAIN
 from custom_components.evse_bus.diagnostics import async_get_config_entry_diagnostics
+from custom_components.evse_bus.orders import ORDERS_KEY, Record, SupplyOrder
 from tests.common import (
     call,
     charger,
     entity_id,
     get_entity,
+    orders_file,
     running,
     setup_bus,
+    shut_down,
     state_of,
     wait_for_state,
     wait_until,
@@ -29,7 +32,6 @@ from tests.smartevse import car, shorten
 from tests.test_coordinator import issue
 from tests.virtual import SmartEvse, VirtualBus, smartevse_requests_in
 
-STORE = "evse_bus.bus"
 SUPPLY = {"supply_limit": 20.0, "supply_minimum": 6.0}
 
 
@@ -79,6 +81,11 @@ async def both_charge(
         await wait_for_state(hass, status, "charging")
 
 
+def stored_supply(storage: dict[str, Any]) -> float | None:
+    record = storage[ORDERS_KEY]["data"]["bus:bus"]
+    return record["supply"]  # type: ignore[no-any-return]
+
+
 async def test_a_supply_is_shared(
     hass: HomeAssistant, hass_storage: dict[str, Any]
 ) -> None:
@@ -99,7 +106,7 @@ async def test_a_supply_is_shared(
             lambda: broadcasts(bus)[-1] == (0, 72, 72, 0), timeout=0.5
         )
         assert state_of(hass, supply) == "14.5"
-        assert hass_storage[STORE]["data"]["bus"] == {"supply": 14.5}
+        assert stored_supply(hass_storage) == 14.5
         offered = await get_entity(hass, "sensor", entry, "offered_current")
         await wait_for_state(hass, offered, "7.2")
         # What one may ask for does not go down with its share.
@@ -115,12 +122,7 @@ async def test_a_supply_is_shared(
 async def test_the_shared_supply_outlives_a_restart(
     hass: HomeAssistant, hass_storage: dict[str, Any]
 ) -> None:
-    hass_storage[STORE] = {
-        "version": 1,
-        "minor_version": 1,
-        "key": STORE,
-        "data": {"bus": {"supply": 8.0}},
-    }
+    hass_storage[ORDERS_KEY] = orders_file(bus__bus=Record(SupplyOrder(8.0)))
     boxes = slaves()
     async with running(
         hass, *boxes, supply=SUPPLY, fail_safe_current=16.0, installation_limit=16.0
@@ -140,8 +142,8 @@ async def test_a_lost_supply_is_told(
 ) -> None:
     async with running(hass, *slaves(), supply=SUPPLY) as (entry, _):
         await get_entity(hass, "sensor", entry, "1_status")
-        await hass.config_entries.async_unload(entry.entry_id)
-        del hass_storage[STORE]
+        await shut_down(hass, entry)
+        del hass_storage[ORDERS_KEY]
         await hass.config_entries.async_setup(entry.entry_id)
         supply = bus_entity(hass, "number", "shared_supply")
         assert state_of(hass, supply) == "6.0"
@@ -178,7 +180,7 @@ async def test_an_order_that_nobody_waits_for_any_more_counts(
             disk.set()
             await bus.wait_for_async(lambda: broadcasts(bus)[-1] == (0, 65, 65, 0))
         assert state_of(hass, supply) == "13.0"
-        assert hass_storage[STORE]["data"]["bus"] == {"supply": 13.0}
+        assert stored_supply(hass_storage) == 13.0
 
 
 async def test_a_smaller_installation_counts_at_once(hass: HomeAssistant) -> None:

@@ -12,14 +12,16 @@ import pytest
 from custom_components.evse_bus.evse.errors import RefusedOrderError
 from custom_components.evse_bus.evse.model import Circuit, CurrentLimit, Orders
 from custom_components.evse_bus.orders import (
+    ORDERS_KEY,
     OrderStore,
+    Record,
     SupplyOrder,
-    decode_supply,
+    decode,
     encode,
 )
 from custom_components.evse_bus.supply import SharedSupply
 
-STORE = "evse_bus.bus"
+BUS = "bus:bus"
 INSTALLED = Circuit(limit=25.0, minimum=8.0)
 
 amounts = st.none() | st.floats(0, 240)
@@ -27,9 +29,9 @@ amounts = st.none() | st.floats(0, 240)
 
 def stored(supply: object, **chargers: Orders) -> dict[str, Any]:
     """Return a file with an order about the supply."""
-    records = {key: encode(orders) for key, orders in chargers.items()}
-    data = {"bus": {"supply": supply}, **records}
-    return {"version": 1, "minor_version": 1, "key": STORE, "data": data}
+    records = {key: encode(Record(orders)) for key, orders in chargers.items()}
+    data = {BUS: {"supply": supply, "lost": False}, **records}
+    return {"version": 1, "minor_version": 1, "key": ORDERS_KEY, "data": data}
 
 
 class Sharing:
@@ -37,15 +39,17 @@ class Sharing:
 
     def __init__(self, hass: HomeAssistant, installed: Circuit = INSTALLED) -> None:
         self.told: list[float] = []
-        self.orders = OrderStore(hass, "bus")
-        self.supply = SharedSupply(installed, self.orders, self.follow)
+        self.orders = OrderStore(hass)
+        self.supply = SharedSupply(installed, self.orders, BUS, self.follow)
 
     async def follow(self, supply: Circuit) -> None:
         self.told.append(supply.limit)
 
     async def begin(self, *, new: bool = False) -> bool:
+        """Return whether there was an order, or none was expected."""
         await self.orders.async_load()
-        return await self.supply.async_start(is_new=new)
+        assert await self.supply.async_start(registered=not new)
+        return not self.supply.is_lost
 
 
 @given(amounts, amounts)
@@ -58,7 +62,7 @@ def test_a_raise_is_what_allows_more(one: float | None, two: float | None) -> No
 @pytest.mark.parametrize("damage", ["16", nan, inf, -1, [], {}, True])
 def test_damage_is_never_an_order(damage: object) -> None:
     with pytest.raises((RefusedOrderError, TypeError)):
-        decode_supply({"supply": damage})
+        decode({"supply": damage, "lost": False})
 
 
 async def test_a_new_bus_shares_all_there_is(
@@ -68,7 +72,7 @@ async def test_a_new_bus_shares_all_there_is(
     assert await sharing.begin(new=True)
     assert sharing.told == [25.0]
     # Nobody has said anything yet: what the installation gives may still change.
-    assert hass_storage[STORE]["data"] == {"bus": {"supply": None}}
+    assert hass_storage[ORDERS_KEY] == stored(None)
     await sharing.supply.async_update_installed(Circuit(limit=32.0))
     assert sharing.supply.limit == 32.0
 
@@ -76,24 +80,23 @@ async def test_a_new_bus_shares_all_there_is(
 async def test_an_order_outlives_a_restart(
     hass: HomeAssistant, hass_storage: dict[str, Any]
 ) -> None:
-    hass_storage[STORE] = stored(11.5, one=Orders(limit=CurrentLimit(current=9.0)))
+    hass_storage[ORDERS_KEY] = stored(11.5, one=Orders(limit=CurrentLimit(current=9.0)))
     sharing = Sharing(hass)
     assert await sharing.begin()
     assert sharing.told == [11.5]
-    orders = sharing.orders.get("one")
-    assert orders
-    assert orders.limit.current == 9.0
-    assert sharing.orders.get("bus") is None
+    assert sharing.orders.get("one") == Orders(limit=CurrentLimit(current=9.0))
+    assert sharing.orders.supply("one") is None
 
 
 @pytest.mark.parametrize(
-    "content", [None, stored("x"), stored(-3), {"version": 99, "key": STORE, "data": 0}]
+    "content",
+    [None, stored("x"), stored(-3), {"version": 99, "key": ORDERS_KEY, "data": 0}],
 )
 async def test_a_lost_order_is_as_little_as_lets_a_car_charge(
     hass: HomeAssistant, hass_storage: dict[str, Any], content: dict[str, Any] | None
 ) -> None:
     if content is not None:
-        hass_storage[STORE] = content
+        hass_storage[ORDERS_KEY] = content
     sharing = Sharing(hass)
     assert not await sharing.begin()
     assert sharing.told == [8.0]
@@ -102,7 +105,7 @@ async def test_a_lost_order_is_as_little_as_lets_a_car_charge(
 async def test_it_never_exceeds_what_the_installation_gives(
     hass: HomeAssistant, hass_storage: dict[str, Any]
 ) -> None:
-    hass_storage[STORE] = stored(40.0)
+    hass_storage[ORDERS_KEY] = stored(40.0)
     sharing = Sharing(hass)
     await sharing.begin()
     await sharing.supply.async_update_installed(Circuit(limit=16.0))
@@ -126,13 +129,13 @@ async def test_orders_are_rounded_down(hass: HomeAssistant) -> None:
 async def test_a_lowering_is_on_disk_before_it_counts(
     hass: HomeAssistant, hass_storage: dict[str, Any]
 ) -> None:
-    hass_storage[STORE] = stored(20.0)
+    hass_storage[ORDERS_KEY] = stored(20.0)
     sharing = Sharing(hass)
     await sharing.begin()
     written: list[tuple[float, float]] = []
 
     async def watched(self: Store, data: dict[str, Any]) -> None:  # noqa: ARG001 - as Store's
-        written.append((data["data"]["bus"]["supply"], sharing.told[-1]))
+        written.append((data["data"][BUS]["supply"], sharing.told[-1]))
 
     with patch.object(Store, "_async_write_data", watched):
         await sharing.supply.async_order(10)
@@ -142,15 +145,17 @@ async def test_a_lowering_is_on_disk_before_it_counts(
         await sharing.supply.async_order(14)
         assert len(written) == 1
         assert sharing.told[-1] == 14.0
-        await sharing.orders.async_close()
+        await sharing.orders.async_flush()
     assert written[1:] == [(14.0, 14.0)]
 
 
 async def test_chargers_that_go_leave_it_alone(
     hass: HomeAssistant, hass_storage: dict[str, Any]
 ) -> None:
-    hass_storage[STORE] = stored(12.0, gone=Orders(limit=CurrentLimit(current=9.0)))
+    hass_storage[ORDERS_KEY] = stored(
+        12.0, gone=Orders(limit=CurrentLimit(current=9.0))
+    )
     sharing = Sharing(hass)
     await sharing.begin()
-    await sharing.orders.async_keep_only([])
-    assert hass_storage[STORE]["data"] == {"bus": {"supply": 12.0}}
+    await sharing.orders.async_forget(["gone"])
+    assert hass_storage[ORDERS_KEY] == stored(12.0)

@@ -114,7 +114,7 @@ def test_errors_have_texts() -> None:
     texts = english()["exceptions"]
     keys = {key for _, key in (*_PORT_KEYS, *_LISTEN_KEYS, *_COMMAND_KEYS)}
     own = {f"ews_{reason}" for reason in Refusal} | {HiddenSecretError.text_key}
-    assert keys | own | set(ActionError) == texts.keys()
+    assert keys | own | set(ActionError) | {NOT_STORED} == texts.keys()
     placeholders = dict.fromkeys(("charger", "port", "error", "expected", "found"), "x")
     for key in keys:
         assert texts[key]["message"].format(**placeholders)

@@ -3,6 +3,7 @@
 A config entry is one port or listener; each charger on it is a config subentry.
 """
 
+from functools import partial
 from typing import Any, Final
 
 from homeassistant.config_entries import ConfigEntryState
@@ -16,7 +17,7 @@ from homeassistant.helpers import config_validation as cv
 from homeassistant.helpers.device_registry import ChildDeviceEntry, DeviceEntry
 from homeassistant.helpers.typing import ConfigType
 
-from .configuration import rebuild_data
+from .configuration import protocol_of, rebuild_data
 from .connections import ListenerConnections
 from .const import DOMAIN
 from .coordinator import BusCoordinator, EvseBusConfigEntry
@@ -27,7 +28,8 @@ from .discovery import (
 )
 from .errors import not_ready
 from .evse.errors import LineError
-from .orders import OrderStore
+from .issues import report_orders_written
+from .orders import ORDERS, OrderStore, bus_key, subentry_keys
 from .services import async_register
 
 CONFIG_SCHEMA = cv.config_entry_only_config_schema(DOMAIN)
@@ -47,7 +49,8 @@ async def async_setup(
     hass: HomeAssistant,
     config: ConfigType,  # noqa: ARG001 - there is no YAML
 ) -> bool:
-    """Register the actions; everything else belongs to a config entry."""
+    """Register the actions and the store of orders, which all config entries share."""
+    hass.data[ORDERS] = OrderStore(hass, partial(report_orders_written, hass))
     async_register(hass)
     return True
 
@@ -95,9 +98,17 @@ async def async_unload_entry(hass: HomeAssistant, entry: EvseBusConfigEntry) -> 
 
 
 async def async_remove_entry(hass: HomeAssistant, entry: EvseBusConfigEntry) -> None:
-    """Delete the stored orders and the discovery flows of a removed entry."""
+    """Delete the stored orders and the discovery flows of a removed entry.
+
+    The orders of a charger with a serial number stay: it may return on another bus.
+    """
     async_listener_gone(hass, entry)
-    await OrderStore(hass, entry.entry_id).async_remove()
+    orders = hass.data[ORDERS]
+    await orders.async_load()
+    keys = [bus_key(entry.entry_id)]
+    for subentry_id in entry.subentries:
+        keys += subentry_keys(subentry_id, protocol_of(entry.data).ports)
+    await orders.async_forget(keys)
 
 
 async def async_remove_config_entry_device(

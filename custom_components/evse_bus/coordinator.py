@@ -13,6 +13,7 @@ from typing import Any, Final, override
 
 from homeassistant.config_entries import ConfigEntry, ConfigSubentry
 from homeassistant.core import CALLBACK_TYPE, Event, HomeAssistant, callback
+from homeassistant.exceptions import ConfigEntryNotReady
 from homeassistant.helpers.event import async_track_time_interval
 from homeassistant.helpers.update_coordinator import BaseDataUpdateCoordinatorProtocol
 from homeassistant.util import dt as dt_util
@@ -26,15 +27,22 @@ from .configuration import (
     supply_of,
 )
 from .connections import make_connections
-from .const import CONF_SERIAL, LOGGER, SUBENTRY_CHARGER
+from .const import CONF_SERIAL, DOMAIN, LOGGER, SUBENTRY_CHARGER
 from .devices import BusDevices
 from .discovery import async_set_up_now, async_wants_to_connect
 from .evse.bus import Bus
 from .evse.listeners import notify
 from .evse.model import ChargerConfig, Circuit, Orders
-from .issues import BusIssues
+from .evse.safety import cautious
+from .issues import NOT_STORED, BusIssues
 from .managed_charger import ManagedCharger, async_shut_down_chargers
-from .orders import OrderStore, async_run_uncancelled
+from .orders import (
+    ORDERS,
+    async_run_uncancelled,
+    bus_key,
+    charger_keys,
+    stopped,
+)
 from .supply import SharedSupply
 
 type EvseBusConfigEntry = ConfigEntry[BusCoordinator]
@@ -65,11 +73,18 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         self.chargers: dict[str, ManagedCharger] = {}
         self.issues = BusIssues(hass, entry)
         self.devices = BusDevices(hass, entry, self.protocol.name)
-        self.orders = OrderStore(hass, entry.entry_id, self.issues.orders_written)
+        self.orders = hass.data[ORDERS]
         self.supply: SharedSupply | None = None
         """What the chargers share; ``None``: they share nothing."""
         if (installed := supply_of(entry.data)) is not None:
-            self.supply = SharedSupply(installed, self.orders, self._async_apply_supply)
+            self.supply = SharedSupply(
+                installed,
+                self.orders,
+                bus_key(entry.entry_id),
+                self._async_apply_supply,
+            )
+        self._not_stored: dict[str, tuple[str, ...]] = {}
+        """New chargers whose first orders cannot be stored, with their order keys."""
         self._listeners: dict[Context, list[CALLBACK_TYPE]] = {}
         self._platforms: list[Callable[[ManagedCharger], None]] = []
         self._unsubscribe: list[CALLBACK_TYPE] = []
@@ -91,8 +106,13 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
     # -- Start and stop ----------------------------------------------------------
 
     async def async_start(self) -> None:
-        """Load the orders and open the port; raises LineError."""
+        """Load the orders and open the port.
+
+        Raises LineError, and ConfigEntryNotReady when the first order of a new bus
+        cannot be stored.
+        """
         await self.orders.async_load()
+        self._unsubscribe.append(self.orders.subscribe(self._on_orders_stored))
         await self._async_start_supply()
         await self.async_sync_subentries()
         if self.bus is not None:
@@ -102,9 +122,12 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
     async def _async_start_supply(self) -> None:
         if self.supply is None or self.connections.master is None:
             return
-        # The device registry outlives restarts: a known bus must have a stored order.
-        is_new = not self.devices.has(self.config_entry.entry_id)
-        if not await self.supply.async_start(is_new=is_new):
+        registered = self.devices.has(self.config_entry.entry_id)
+        if not await self.supply.async_start(registered=registered):
+            raise ConfigEntryNotReady(
+                translation_domain=DOMAIN, translation_key=NOT_STORED
+            )
+        if self.supply.is_lost:
             self.issues.supply_lost(self.supply.limit)
         self._unsubscribe.append(self.connections.master.subscribe(self._on_master))
 
@@ -124,7 +147,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
             await self.connections.stop()
             for managed in self.chargers.values():
                 managed.unsubscribe()
-            await self.orders.async_close()
+            await self.orders.async_flush()
             self.issues.clear()
 
     # -- Shared supply -----------------------------------------------------------
@@ -181,27 +204,43 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
                     await self._async_add_charger(subentry, config)
                 else:
                     await self._async_change_charger(managed, subentry, config)
-            await self.orders.async_keep_only(configured)
+            for key in self._not_stored.keys() - configured.keys():
+                await self.orders.async_forget(self._not_stored.pop(key))
+
+    @callback
+    def _on_orders_stored(self) -> None:
+        """Start new chargers that waited for their first orders to be stored."""
+        if self._not_stored:
+            self.hass.async_create_task(
+                self.async_sync_subentries(), "evse_bus waiting chargers"
+            )
 
     async def _async_add_charger(
         self, subentry: ConfigSubentry, config: ChargerConfig
     ) -> None:
         key = config.key
-        orders = self.orders.get(key)
-        # The device registry outlives restarts: a known charger must have had orders.
-        lost = orders is None and self.devices.has(key, subentry.subentry_id)
+        order_keys = charger_keys(self.protocol, subentry.subentry_id, config)
+        first = initial_orders(subentry, config)
+        orders = await self.orders.async_begin(
+            order_keys,
+            first=first,
+            fallback=stopped(first),
+            owner=subentry.subentry_id,
+            # The device registry outlives restarts.
+            registered=self.devices.has(key, subentry.subentry_id),
+        )
         if orders is None:
-            orders = initial_orders(subentry, config)
-            await self.orders.async_commit(key, orders)
+            self._not_stored[key] = order_keys
+            return
+        self._not_stored.pop(key, None)
         charger = self.protocol.charger(config, orders)
         port_number = config.address if self.protocol.ports > 1 else None
         bus = await self.connections.acquire_bus(config, subentry.title)
-        managed = ManagedCharger(subentry, charger, bus, port_number)
+        managed = ManagedCharger(subentry, charger, bus, order_keys[0], port_number)
         self.chargers[key] = managed
         self.devices.register_charger(managed)
-        if lost:
-            self.issues.orders_lost(managed, orders)
         self._put_on_bus(managed)
+        self._report_lost_orders(managed)
         self._add_entities(managed)
         async_set_up_now(self.hass, subentry)
 
@@ -215,19 +254,45 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         LOGGER.debug("%s: configuration changed", config.name)
         # Its new serial number may be that of a box that is being offered.
         async_set_up_now(self.hass, subentry)
-        if changes_in_place(old.config, config):
+        earlier = self._move_orders(managed, config)
+        if earlier is None and changes_in_place(old.config, config):
             old.reconfigure(config)
         else:
             managed.unsubscribe()
             await managed.bus.remove(old)
             await self.connections.release_bus(managed.bus)
             self.issues.forget(managed)
-            managed.charger = self.protocol.charger(config, old.orders)
+            orders = old.orders if earlier is None else cautious(old.orders, earlier)
+            managed.charger = self.protocol.charger(config, orders)
             managed.bus = await self.connections.acquire_bus(config, subentry.title)
         self.devices.register_charger(managed)
         if managed.charger is not old:
             self._put_on_bus(managed)
+            self._report_lost_orders(managed)
         self._on_charger(managed)
+        await self.orders.async_flush()
+
+    def _report_lost_orders(self, managed: ManagedCharger) -> None:
+        if self.orders.is_lost(managed.order_key):
+            self.issues.orders_lost(managed, managed.charger.orders)
+
+    def _move_orders(
+        self, managed: ManagedCharger, config: ChargerConfig
+    ) -> Orders | None:
+        """Give the orders another key, if the serial number has changed.
+
+        Returns the orders that the box had earlier, if they lower those it has now.
+        """
+        keys = charger_keys(self.protocol, managed.subentry_id, config)
+        if keys[0] == managed.order_key:
+            return None
+        orders = self.orders.move(keys, managed.order_key, managed.subentry_id)
+        managed.order_key = keys[0]
+        now = managed.charger.orders
+        if orders is None or cautious(now, orders) == now:
+            return None
+        LOGGER.info("%s: its earlier, lower orders count again", config.name)
+        return orders
 
     async def _async_remove_charger(self, managed: ManagedCharger) -> None:
         managed.unsubscribe()
@@ -237,6 +302,9 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         del self.chargers[managed.key]
         self.devices.remove_port(managed)
         self.issues.forget(managed)
+        await self.orders.async_forget(
+            charger_keys(self.protocol, managed.subentry_id, managed.charger.config)
+        )
         self._notify(BUS)
 
     def _put_on_bus(self, managed: ManagedCharger) -> None:
@@ -253,8 +321,14 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         managed.subscriptions.append(charger.subscribe_events(managed.events.publish))
 
     async def _async_commit(self, managed: ManagedCharger, orders: Orders) -> None:
+        await self.orders.async_commit(managed.order_key, orders)
+        if not self.orders.is_lost(managed.order_key):
+            self.issues.orders_renewed(managed)
+
+    async def async_permission_set(self, managed: ManagedCharger) -> None:
+        """Accept that the user has decided whether a charger may charge."""
+        await self.orders.async_accept(managed.order_key)
         self.issues.orders_renewed(managed)
-        await self.orders.async_commit(managed.key, orders)
 
     # -- Updates from the library ------------------------------------------------
 

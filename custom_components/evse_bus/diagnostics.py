@@ -115,7 +115,7 @@ def _master(coordinator: BusCoordinator) -> dict[str, Any] | None:
     return {
         "silent": master.silent,
         "noticed": plain(master.noticed),
-        "order": plain(coordinator.orders.supply),
+        "order": plain(coordinator.supply and coordinator.supply.order),
         "statistics": plain(master.statistics),
         **details,
     }

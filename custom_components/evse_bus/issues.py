@@ -26,6 +26,28 @@ UNKNOWN_FIRMWARE: Final = "unknown_firmware"
 UNSUPPORTED_FIRMWARE: Final = "unsupported_firmware"
 
 
+def report_orders_written(hass: HomeAssistant, error: Exception | None) -> None:
+    """Report that orders cannot be stored; ``None``: they can, clear the report."""
+    if error is None:
+        ir.async_delete_issue(hass, DOMAIN, NOT_STORED)
+    else:
+        _create(hass, NOT_STORED, NOT_STORED, {"error": str(error)})
+
+
+def _create(
+    hass: HomeAssistant, issue: str, key: str, placeholders: dict[str, str]
+) -> None:
+    ir.async_create_issue(
+        hass,
+        DOMAIN,
+        issue,
+        is_fixable=False,
+        severity=ir.IssueSeverity.ERROR,
+        translation_key=key,
+        translation_placeholders=placeholders,
+    )
+
+
 class BusIssues:
     """The repair issues of one config entry."""
 
@@ -34,15 +56,6 @@ class BusIssues:
         self._hass = hass
         self._entry = entry
         self._open: dict[str, dict[str, str]] = {}
-
-    def orders_written(self, error: Exception | None) -> None:
-        """Report whether the orders could be written; ``None``: they were."""
-        self._set(
-            NOT_STORED,
-            self._entry.entry_id,
-            present=error is not None,
-            placeholders={"bus": self._entry.title, "error": str(error)},
-        )
 
     def orders_lost(self, managed: ManagedCharger, orders: Orders) -> None:
         """Report that a charger's stored orders are missing."""
@@ -57,7 +70,7 @@ class BusIssues:
         )
 
     def orders_renewed(self, managed: ManagedCharger) -> None:
-        """Clear the report of missing orders: the charger has new ones."""
+        """Clear the report of missing orders: the user has given new ones."""
         self._set(LOST, managed.key, present=False)
 
     def supply_lost(self, current: float) -> None:
@@ -178,15 +191,7 @@ class BusIssues:
         if self._open.get(issue) == shown:
             return
         self._open[issue] = shown
-        ir.async_create_issue(
-            self._hass,
-            DOMAIN,
-            issue,
-            is_fixable=False,
-            severity=ir.IssueSeverity.ERROR,
-            translation_key=key,
-            translation_placeholders=shown,
-        )
+        _create(self._hass, issue, key, shown)
 
     def _delete(self, issue: str) -> None:
         self._open.pop(issue, None)

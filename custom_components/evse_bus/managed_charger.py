@@ -27,11 +27,14 @@ class ManagedCharger:
         subentry: ConfigSubentry,
         charger: Charger,
         bus: Bus,
+        order_key: str,
         port_number: int | None = None,
     ) -> None:
         """Start without connectors, entities or subscriptions."""
         self.key = charger.config.key
-        """Prefix of its unique ids; its key in stored orders and listener contexts."""
+        """Prefix of its unique ids; its key in listener contexts."""
+        self.order_key = order_key
+        """Key of its stored orders."""
         self.subentry_id = subentry.subentry_id
         self.subentry = subentry
         self.charger = charger

@@ -1,32 +1,66 @@
-"""Storage of the orders of a bus and of its chargers.
+"""Storage of the orders of all chargers and buses.
 
 Restored entity states may be minutes old after a crash, and are missing for a disabled
-entity; a limit must be neither. So each bus has a file for its orders. A lowering is on
-disk before it is sent. A raise is written soon after the charger has confirmed it:
-losing one only means a lower limit.
+entity; a limit must be neither. A restart must never allow more than the user's last
+order, so:
+
+- A lowering is on disk before it is sent. A raise is written soon after the charger
+  has confirmed it: losing one only means a lower limit.
+- What the disk refuses stays pending and is written again. Until then a file that
+  allows more than was ordered is deleted, which also works on a full disk.
+- A second file lists the chargers that have had orders. One of them without a usable
+  record has lost it, and is stopped until the user allows it to charge.
+- A new charger is not started before both files have it.
+
+Orders belong to a charger's serial number, where it is known, and not to its bus: they
+stay when the charger moves to another bus or is removed and added again.
 """
 
 import asyncio
-from collections.abc import Callable, Coroutine, Iterable, Mapping
-from dataclasses import dataclass
-from typing import Any, Final, override
+from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+from functools import reduce
+from typing import Any, Final
 
-from homeassistant.core import HomeAssistant
+from homeassistant.const import EVENT_HOMEASSISTANT_FINAL_WRITE
+from homeassistant.core import (
+    CALLBACK_TYPE,
+    Event,
+    HassJob,
+    HomeAssistant,
+    callback,
+)
 from homeassistant.exceptions import HomeAssistantError
+from homeassistant.helpers.event import async_call_later
 from homeassistant.helpers.storage import Store
 from homeassistant.util.file import WriteError
+from homeassistant.util.hass_dict import HassKey
 from homeassistant.util.json import SerializationError
 
 from .const import DOMAIN, LOGGER
 from .evse.errors import RefusedOrderError
-from .evse.model import CurrentLimit, Orders, Phases
+from .evse.listeners import Observable
+from .evse.model import ChargerConfig, CurrentLimit, Orders, Phases
+from .evse.protocol import Protocol
 from .evse.safety import cautious, number
 
 STORAGE_VERSION: Final = 1
+ORDERS_KEY: Final = f"{DOMAIN}.orders"
+KNOWN_KEY: Final = f"{DOMAIN}.known_chargers"
+"""File names in the storage folder of Home Assistant."""
+
 RAISE_DELAY: Final = 1.0
 """Delay before a raise is written, to combine several, s."""
+RETRY_FIRST: Final = 5.0
+"""First pause before a refused write is tried again, s; doubles."""
+RETRY_LIMIT: Final = 300.0
+"""Longest such pause, s."""
 
-type _Stored = dict[str, dict[str, Any]]
+_SERIAL: Final = "serial:"
+_SUBENTRY: Final = "subentry:"
+_BUS: Final = "bus:"
+"""Prefixes of the keys of records, by what they belong to."""
 
 _UNREADABLE = (
     HomeAssistantError,  # also a version from the future
@@ -60,117 +94,7 @@ def _retrieve_exception(task: asyncio.Task[Any]) -> None:
         task.exception()
 
 
-class OrderStore:
-    """The stored orders of one config entry: of its chargers, and of its bus."""
-
-    def __init__(
-        self,
-        hass: HomeAssistant,
-        entry_id: str,
-        on_write: Callable[[Exception | None], None] = lambda _error: None,
-    ) -> None:
-        """Read nothing yet; ``on_write`` is called after each write, with its error."""
-        self._hass = hass
-        self._store = _WatchedStore(hass, entry_id, on_write)
-        self._bus_key = entry_id
-        self._orders: dict[str, Orders] = {}
-        self._supply: SupplyOrder | None = None
-        self._pending = False
-        self._writing = asyncio.Lock()
-
-    async def async_load(self) -> None:
-        """Read the file; an unreadable one is treated as missing."""
-        self._orders = {}
-        self._supply = None
-        try:
-            stored = await self._store.async_load()
-            records = dict(stored or {})
-        except _UNREADABLE as error:
-            LOGGER.error("The stored orders cannot be read: %s", error)
-            return
-        for key, record in records.items():
-            try:
-                if key == self._bus_key:
-                    self._supply = decode_supply(record)
-                else:
-                    self._orders[key] = decode(record)
-            except (RefusedOrderError, *_UNREADABLE) as error:
-                LOGGER.error("A stored order cannot be used: %s", error)
-
-    def get(self, key: str) -> Orders | None:
-        """Return a charger's orders; ``None``: none stored, or unreadable."""
-        return self._orders.get(key)
-
-    @property
-    def supply(self) -> SupplyOrder | None:
-        """Return the order for the shared supply; ``None``: none, or unreadable."""
-        return self._supply
-
-    async def async_commit(self, key: str, orders: Orders) -> None:
-        """Store a charger's orders: a lowering is on disk when this returns.
-
-        A failed write raises nothing: the order is sent all the same, and ``on_write``
-        gets the error.
-        """
-        before = self._orders.get(key)
-        if orders == before:
-            return
-        self._orders[key] = orders
-        await self._write(
-            soon=before is not None and cautious(before, orders) != orders
-        )
-
-    async def async_commit_supply(self, supply: SupplyOrder) -> None:
-        """Store the order for the shared supply, in the same way as `async_commit`."""
-        before = self._supply
-        if supply == before:
-            return
-        self._supply = supply
-        await self._write(soon=before is not None and supply.raises(before))
-
-    async def _write(self, *, soon: bool) -> None:
-        """Write now; ``soon``: after a delay, together with further changes."""
-        if not soon:
-            await self.async_flush()
-            return
-        self._pending = True
-        self._store.async_delay_save(self._encoded, RAISE_DELAY)
-
-    async def async_keep_only(self, keys: Iterable[str]) -> None:
-        """Delete the orders of all other chargers."""
-        obsolete = self._orders.keys() - set(keys)
-        for key in obsolete:
-            del self._orders[key]
-        if obsolete:
-            await self.async_flush()
-
-    async def async_flush(self) -> None:
-        """Write pending changes now."""
-        self._pending = False
-        await async_run_uncancelled(self._hass, self._async_save(), "evse_bus orders")
-
-    async def _async_save(self) -> None:
-        async with self._writing:
-            await self._store.async_save(self._encoded())
-
-    async def async_close(self) -> None:
-        """Write pending changes and wait for writes in progress."""
-        if self._pending:
-            await self.async_flush()
-        # The file may be read again at once, after a reload.
-        async with self._writing:
-            pass
-
-    async def async_remove(self) -> None:
-        """Delete the file."""
-        self._pending = False
-        await self._store.async_remove()
-
-    def _encoded(self) -> _Stored:
-        encoded = {key: encode(orders) for key, orders in self._orders.items()}
-        if self._supply is not None:
-            encoded[self._bus_key] = {"supply": self._supply.limit}
-        return encoded
+# -- Records ---------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,67 +111,449 @@ class SupplyOrder:
         return self.limit > before.limit
 
 
-class _WatchedStore(Store[_Stored]):
-    """A store that reports the result of each write; `Store` only logs errors."""
+type Order = Orders | SupplyOrder
+
+
+@dataclass(frozen=True, slots=True)
+class Record[O: Order]:
+    """One order as it is stored."""
+
+    order: O
+    owner: str = ""
+    """Id of the subentry that the charger was added with."""
+    lost: bool = False
+    """The real order was lost; this one stands until the user gives another."""
+
+
+def allows_more(one: Order, other: Order) -> bool:
+    """Return whether one order allows more than another, in any respect."""
+    if isinstance(one, SupplyOrder) or isinstance(other, SupplyOrder):
+        return (
+            not isinstance(one, SupplyOrder)
+            or not isinstance(other, SupplyOrder)
+            or one.raises(other)
+        )
+    # Whether a longer time-out is safer is not known, so `cautious` keeps the old one.
+    return cautious(one, other) != one
+
+
+def stopped(orders: Orders) -> Orders:
+    """Return orders that replace lost ones: no permission, the limits as they are."""
+    return replace(orders, allowed=False)
+
+
+def bus_key(entry_id: str) -> str:
+    """Return the key of the order for the shared supply of a bus."""
+    return f"{_BUS}{entry_id}"
+
+
+def charger_keys(
+    protocol: Protocol, subentry_id: str, config: ChargerConfig
+) -> tuple[str, ...]:
+    """Return the keys of a charger's orders: its own, then one it may have had before.
+
+    A charger is known by its subentry until its serial number has been read.
+    """
+    port = f"_{config.address}" if protocol.ports > 1 else ""
+    by_subentry = f"{_SUBENTRY}{subentry_id}{port}"
+    if config.serial is None:
+        return (by_subentry,)
+    return (f"{_SERIAL}{protocol.unique_id(config.serial)}{port}", by_subentry)
+
+
+def subentry_keys(subentry_id: str, ports: int) -> list[str]:
+    """Return all keys that a charger without a serial number can have."""
+    key = f"{_SUBENTRY}{subentry_id}"
+    return [key, *(f"{key}_{port}" for port in range(1, ports + 1))]
+
+
+# -- The store -------------------------------------------------------------------
+
+
+class OrderStore(Observable):
+    """The stored orders of all chargers and buses of Home Assistant.
+
+    Listeners are called after each successful write.
+    """
 
     def __init__(
         self,
         hass: HomeAssistant,
-        entry_id: str,
-        on_write: Callable[[Exception | None], None],
+        on_write: Callable[[Exception | None], None] = lambda _error: None,
     ) -> None:
-        super().__init__(
-            hass, STORAGE_VERSION, f"{DOMAIN}.{entry_id}", atomic_writes=True
-        )
+        """Read nothing yet; ``on_write`` is called after each write, with its error."""
+        super().__init__()
+        self._hass = hass
+        self._orders_file = _File(hass, ORDERS_KEY)
+        self._known_file = _File(hass, KNOWN_KEY)
         self._on_write = on_write
         self._failed = False
+        self._loaded = False
+        self._records: dict[str, Record[Any]] = {}
+        self._known: set[str] = set()
+        """Keys of all chargers and buses that have had orders."""
+        self._on_disk: dict[str, list[Order]] = {}
+        """All orders that a restart could find: more than one after a failed write."""
+        self._known_on_disk: frozenset[str] = frozenset()
+        self._pending = False
+        self._retry_pause = RETRY_FIRST
+        self._cancel_timer: CALLBACK_TYPE | None = None
+        self._busy = asyncio.Lock()
+        """Held while a file is read or written."""
+        hass.bus.async_listen_once(
+            EVENT_HOMEASSISTANT_FINAL_WRITE, self._async_final_write
+        )
 
-    @override
-    async def _async_write_data(self, data: dict[str, Any]) -> None:
+    async def async_load(self) -> None:
+        """Read the files, once; an unreadable one is treated as missing."""
+        async with self._busy:
+            if self._loaded:
+                return
+            known = await self._async_read(self._known_file)
+            stored = await self._async_read(self._orders_file)
+            keys = known.get("keys")
+            if isinstance(keys, list):
+                self._known = {key for key in keys if isinstance(key, str)}
+            self._known_on_disk = frozenset(self._known)
+            for key, record in stored.items():
+                try:
+                    self._records[key] = decode(record)
+                except (RefusedOrderError, *_UNREADABLE) as error:
+                    LOGGER.error("A stored order cannot be used: %s", error)
+            self._known |= self._records.keys()
+            self._on_disk = {key: [one.order] for key, one in self._records.items()}
+            self._loaded = True
+
+    async def _async_read(self, file: _File) -> dict[str, Any]:
         try:
-            await super()._async_write_data(data)
-        except (WriteError, SerializationError, OSError) as error:
-            if not self._failed:
-                LOGGER.error("Orders cannot be stored: %s", error)
-            self._failed = True
-            self._on_write(error)
+            return dict(await file.async_load() or {})
+        except _UNREADABLE as error:
+            LOGGER.error("The stored orders cannot be read: %s", error)
+            return {}
+
+    def get(self, key: str) -> Order | None:
+        """Return an order; ``None``: none stored, or unreadable."""
+        record = self._records.get(key)
+        return None if record is None else record.order
+
+    def supply(self, key: str) -> SupplyOrder | None:
+        """Return the order for a shared supply; ``None``: none, or unreadable."""
+        order = self.get(key)
+        return order if isinstance(order, SupplyOrder) else None
+
+    def is_lost(self, key: str) -> bool:
+        """Return whether the real order was lost and the user gave no other."""
+        record = self._records.get(key)
+        return record is not None and record.lost
+
+    async def async_begin[O: Order](
+        self,
+        keys: Sequence[str],
+        first: O,
+        fallback: O,
+        *,
+        owner: str = "",
+        registered: bool = False,
+    ) -> O | None:
+        """Return the order that a charger or bus starts with.
+
+        ``keys``: its own key, then others under which it may be stored. ``first`` is
+        the order of a new one, ``fallback`` that of one whose order is lost.
+        ``registered``: it is known from elsewhere that it has had orders.
+
+        Returns ``None`` for a new one that cannot be stored: if it were started, a
+        restart could not tell that it has had orders. Listeners are called when it
+        can be.
+        """
+        key = keys[0]
+        kind = type(first)
+        found = [
+            record
+            for one in reversed(keys)
+            if (record := self._records.get(one)) is not None
+            and isinstance(record.order, kind)
+        ]
+        had_orders = registered or any(one in self._known for one in keys)
+        if found:
+            record = self._merged(found, first, owner)
+        elif had_orders:
+            record = Record(fallback, owner, lost=True)
         else:
-            self._failed = False
-            self._on_write(None)
+            record = Record(first, owner)
+        safe = registered or any(one in self._known_on_disk for one in keys)
+        self._replace(keys, record)
+        if self._pending or key not in self._known_on_disk:
+            await self.async_flush()
+        return record.order if safe or key in self._known_on_disk else None
+
+    @staticmethod
+    def _merged(found: Sequence[Record[Any]], first: Order, owner: str) -> Record[Any]:
+        """Return one record of those found; the lower counts where they differ."""
+        newest = found[0]
+        order = newest.order
+        if isinstance(order, Orders):
+            order = reduce(cautious, [record.order for record in found])
+            if newest.owner != owner and isinstance(first, Orders):
+                # Added anew: the fail-safe values were confirmed just now.
+                order = replace(
+                    order,
+                    fail_safe=first.fail_safe,
+                    fail_safe_timeout=first.fail_safe_timeout,
+                )
+        return Record(order, owner, lost=any(one.lost for one in found))
+
+    def _replace(self, keys: Sequence[str], record: Record[Any]) -> None:
+        """Put a record under the first key, and drop it from subentry keys."""
+        key = keys[0]
+        if self._records.get(key) != record:
+            self._records[key] = record
+            self._pending = True
+        self._known.add(key)
+        for other in keys[1:]:
+            if (
+                other.startswith(_SUBENTRY)
+                and self._records.pop(other, None) is not None
+            ):
+                # On disk it stays the order of this charger until the next write.
+                self._on_disk.setdefault(key, []).extend(self._on_disk.pop(other, []))
+                self._pending = True
+
+    def move(self, keys: Sequence[str], old_key: str, owner: str) -> Orders | None:
+        """Give a charger's orders a new key: its serial number has become known.
+
+        Returns its orders, not written yet. They are lower than before if there was a
+        record under the new key: the box was known before.
+        """
+        records = [self._records.get(one) for one in (old_key, keys[0])]
+        found = [one for one in records if one and isinstance(one.order, Orders)]
+        if not found:
+            return None
+        record: Record[Orders] = Record(
+            reduce(cautious, [one.order for one in found]),
+            owner,
+            lost=any(one.lost for one in found),
+        )
+        self._replace((keys[0], old_key), record)
+        return record.order
+
+    async def async_commit(self, key: str, order: Order) -> None:
+        """Store an order: a lowering is on disk when this returns.
+
+        A failed write raises nothing: the order is sent all the same, and written as
+        soon as the disk takes it; ``on_write`` gets the error.
+        """
+        before = self._records.get(key)
+        lost = before is not None and before.lost
+        if isinstance(order, SupplyOrder) or order.allowed:
+            lost = False
+        after = Record(order, before.owner if before else "", lost=lost)
+        if after == before:
+            return
+        self._records[key] = after
+        self._known.add(key)
+        self._pending = True
+        if before is not None and allows_more(order, before.order):
+            self._write_later(RAISE_DELAY)
+        else:
+            await self.async_flush()
+
+    async def async_accept(self, key: str) -> None:
+        """Store that the user has decided what to do about a lost order."""
+        record = self._records.get(key)
+        if record is not None and record.lost:
+            self._records[key] = replace(record, lost=False)
+            self._pending = True
+            await self.async_flush()
+
+    async def async_forget(self, keys: Iterable[str]) -> None:
+        """Delete orders, except those of a serial number: the charger may return."""
+        for key in keys:
+            if not key.startswith(_SERIAL):
+                self._pending |= self._records.pop(key, None) is not None
+                self._on_disk.pop(key, None)
+                self._known.discard(key)
+        if self._pending:
+            await self.async_flush()
+
+    # -- Writing -----------------------------------------------------------------
+
+    async def async_flush(self) -> None:
+        """Write pending changes now, and wait for writes in progress.
+
+        Changes that the disk refuses stay pending.
+        """
+        await async_run_uncancelled(self._hass, self._async_write(), "evse_bus orders")
+
+    async def _async_write(self) -> None:
+        async with self._busy:
+            if not self._pending and self._known == self._known_on_disk:
+                return
+            self._stop_timer()
+            self._pending = False
+            error = await self._async_write_files()
+            if error is None:
+                self._failed = False
+                self._retry_pause = RETRY_FIRST
+            else:
+                self._pending = True
+                if not self._failed:
+                    LOGGER.error("Orders cannot be stored: %s", error)
+                self._failed = True
+                self._write_later(self._retry_pause)
+                self._retry_pause = min(self._retry_pause * 2, RETRY_LIMIT)
+        self._on_write(error)
+        if error is None:
+            self.updated()
+
+    async def _async_write_files(self) -> Exception | None:
+        """Write the orders, then the list of those that have had orders."""
+        orders = {key: record.order for key, record in self._records.items()}
+        data = {key: encode(record) for key, record in self._records.items()}
+        known = frozenset(self._known)
+        error = await self._orders_file.async_write(data)
+        if error is None:
+            self._on_disk = {key: [order] for key, order in orders.items()}
+        else:
+            # It may have been written all the same.
+            for key, order in orders.items():
+                self._may_be_on_disk(key, order)
+            await self._async_withdraw()
+            return error
+        if known != self._known_on_disk:
+            error = await self._known_file.async_write({"keys": sorted(known)})
+            # Removed ones may still be there, new ones may not.
+            self._known_on_disk = (
+                known if error is None else self._known_on_disk & known
+            )
+        return error
+
+    def _may_be_on_disk(self, key: str, order: Order) -> None:
+        """Take note of an order that a restart may find, unless another allows more."""
+        others = self._on_disk.get(key, [])
+        if not any(not allows_more(order, one) for one in others):
+            self._on_disk[key] = [
+                order,
+                *(one for one in others if allows_more(one, order)),
+            ]
+
+    async def _async_withdraw(self) -> None:
+        """Delete the stored orders if they allow more than those that stand.
+
+        A restart then finds no orders, and all chargers are stopped.
+        """
+        if any(
+            allows_more(found, self._records[key].order)
+            for key, orders in self._on_disk.items()
+            if key in self._records
+            for found in orders
+        ):
+            try:
+                await self._orders_file.async_remove()
+            except OSError as error:
+                LOGGER.debug("The stored orders cannot be deleted: %s", error)
+            else:
+                self._on_disk = {}
+
+    def _write_later(self, delay: float) -> None:
+        """Write after a delay, unless a write is planned already."""
+        if self._cancel_timer is None:
+            self._cancel_timer = async_call_later(
+                self._hass,
+                delay,
+                HassJob(self._async_on_timer, cancel_on_shutdown=True),
+            )
+
+    async def _async_on_timer(self, _now: datetime) -> None:
+        self._cancel_timer = None
+        await self.async_flush()
+
+    @callback
+    def _stop_timer(self) -> None:
+        if self._cancel_timer is not None:
+            self._cancel_timer()
+            self._cancel_timer = None
+
+    async def _async_final_write(self, _event: Event) -> None:
+        """Try once more, at the end of a stop of Home Assistant."""
+        await self.async_flush()
+        self._stop_timer()
 
 
-def encode(orders: Orders) -> dict[str, Any]:
-    """Return the stored form of orders."""
-    return {
-        "allowed": orders.allowed,
-        "limit": _encode_limit(orders.limit),
-        "fail_safe": _encode_limit(orders.fail_safe),
-        "fail_safe_timeout": orders.fail_safe_timeout,
-    }
+ORDERS: Final[HassKey[OrderStore]] = HassKey(ORDERS_KEY)
 
 
-def decode(record: Mapping[str, Any]) -> Orders:
-    """Return orders from their stored form.
+class _File(Store[dict[str, Any]]):
+    """A file in the storage folder whose writes have ended when they return."""
+
+    def __init__(self, hass: HomeAssistant, key: str) -> None:
+        super().__init__(hass, STORAGE_VERSION, key, atomic_writes=True)
+
+    async def async_write(self, data: dict[str, Any]) -> Exception | None:
+        """Write now, also while Home Assistant stops; return the error, if any.
+
+        `Store.async_save` would only plan a write while Home Assistant stops, and
+        would not tell whether it succeeds.
+        """
+        self._manager.async_invalidate(self.key)
+        content = {
+            "version": self.version,
+            "minor_version": self.minor_version,
+            "key": self.key,
+            "data": data,
+        }
+        try:
+            await self._async_write_data(content)
+        except (WriteError, SerializationError, OSError) as error:
+            return error
+        return None
+
+
+# -- The stored form -------------------------------------------------------------
+
+
+def encode(record: Record[Any]) -> dict[str, Any]:
+    """Return the stored form of a record."""
+    order = record.order
+    data: dict[str, Any] = (
+        {"supply": order.limit}
+        if isinstance(order, SupplyOrder)
+        else {
+            "owner": record.owner,
+            "allowed": order.allowed,
+            "limit": _encode_limit(order.limit),
+            "fail_safe": _encode_limit(order.fail_safe),
+            "fail_safe_timeout": order.fail_safe_timeout,
+        }
+    )
+    return data | {"lost": record.lost}
+
+
+def decode(stored: Mapping[str, Any]) -> Record[Any]:
+    """Return a record from its stored form.
 
     Raises RefusedOrderError for a number that is negative, not finite or no number,
     and TypeError or KeyError for a record of another shape.
     """
-    allowed = record["allowed"]
-    if not (allowed is None or isinstance(allowed, bool)):
-        message = f"allowed is {allowed!r}"
-        raise TypeError(message)
-    return Orders(
-        allowed=allowed,
-        limit=_decode_limit(record["limit"]),
-        fail_safe=_decode_limit(record["fail_safe"]),
-        fail_safe_timeout=int(number(record["fail_safe_timeout"], "time-out")),
+    lost = _flag(stored["lost"], "lost")
+    if "supply" in stored:
+        limit = stored["supply"]
+        supply = SupplyOrder(None if limit is None else number(limit, "supply"))
+        return Record(supply, lost=lost)
+    allowed = stored["allowed"]
+    orders = Orders(
+        allowed=None if allowed is None else _flag(allowed, "allowed"),
+        limit=_decode_limit(stored["limit"]),
+        fail_safe=_decode_limit(stored["fail_safe"]),
+        fail_safe_timeout=int(number(stored["fail_safe_timeout"], "time-out")),
     )
+    return Record(orders, str(stored["owner"]), lost=lost)
 
 
-def decode_supply(record: Mapping[str, Any]) -> SupplyOrder:
-    """Return an order for the supply from its stored form; raises as `decode` does."""
-    stored = record["supply"]
-    return SupplyOrder(None if stored is None else number(stored, "supply"))
+def _flag(value: object, what: str) -> bool:
+    if not isinstance(value, bool):
+        message = f"{what} is {value!r}"
+        raise TypeError(message)
+    return value
 
 
 def _encode_limit(limit: CurrentLimit) -> dict[str, Any]:

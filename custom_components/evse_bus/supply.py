@@ -24,37 +24,56 @@ class SharedSupply:
         self,
         installed: Circuit,
         orders: OrderStore,
+        key: str,
         apply: Callable[[Circuit], Awaitable[None]],
     ) -> None:
         """Read and apply nothing yet.
 
-        ``installed`` is the limit of the installation. ``apply`` passes a supply to
-        the master of the bus and returns when it has been broadcast.
+        ``installed`` is the limit of the installation, ``key`` that of the stored
+        order. ``apply`` passes a supply to the master of the bus and returns when it
+        has been broadcast.
         """
         self.installed = installed
         self._orders = orders
+        self._key = key
         self._apply = apply
+
+    @property
+    def order(self) -> SupplyOrder | None:
+        """Return the user's order; ``None`` before the start."""
+        return self._orders.supply(self._key)
+
+    @property
+    def is_lost(self) -> bool:
+        """Return whether the stored order was lost and the user gave no other."""
+        return self._orders.is_lost(self._key)
 
     @property
     def limit(self) -> float:
         """Return the current limit in effect, for all chargers together, A per phase."""
-        order = self._orders.supply
+        order = self.order
         if order is None or order.limit is None:
             return self.installed.limit
         return min(order.limit, self.installed.limit)
 
-    async def async_start(self, *, is_new: bool) -> bool:
-        """Apply the stored order; return false when it is lost.
+    async def async_start(self, *, registered: bool) -> bool:
+        """Apply the stored order; return false when it cannot be stored.
 
         A new bus has none and may use the limit of the installation. When a stored
         order is missing, the limit becomes the least that lets one car charge.
+        ``registered``: the bus is known to be no new one.
         """
-        lost = self._orders.supply is None and not is_new
-        if self._orders.supply is None:
-            least = min(self.installed.minimum, self.installed.limit)
-            await self._orders.async_commit_supply(SupplyOrder(least if lost else None))
+        least = min(self.installed.minimum, self.installed.limit)
+        order = await self._orders.async_begin(
+            (self._key,),
+            first=SupplyOrder(None),
+            fallback=SupplyOrder(least),
+            registered=registered,
+        )
+        if order is None:
+            return False
         await self._async_apply()
-        return not lost
+        return True
 
     async def async_order(self, value: float) -> None:
         """Limit the sum of all chargers, A per phase; rounded down to `STEP`.
@@ -66,7 +85,7 @@ class SharedSupply:
         if limit > self.installed.limit:
             message = f"{limit:g} A is above the {self.installed.limit:g} A limit"
             raise RefusedOrderError(message)
-        await self._orders.async_commit_supply(SupplyOrder(round_down(limit, STEP)))
+        await self._orders.async_commit(self._key, SupplyOrder(round_down(limit, STEP)))
         # Reads the limit again: a newer order may have been stored in the meantime.
         await self._async_apply()
 

@@ -168,6 +168,7 @@ class AllowedSwitch(_ChargerSwitch):
     async def async_set(self, *, on: bool) -> None:
         """Change the order."""
         await self.charger.change_orders(OrderChange(allowed=on))
+        await self.coordinator.async_permission_set(self.managed)
 
 
 class CommandSwitch(_ChargerSwitch):
