@@ -10,11 +10,9 @@ from custom_components.evse_bus.evse.model import Circuit, Fault, OrderChange
 from custom_components.evse_bus.evse.scan import ScanResult
 from custom_components.evse_bus.evse.smartevse import MASTER
 from custom_components.evse_bus.evse.smartevse.master import STAY_SILENT, Master
+from tests.evse.smartevse.frames import OTHER_BROADCAST, frame
 from tests.evse.smartevse.scene import MasterScene
 from tests.simulated_time import now, simulate
-
-FOREIGN = bytes.fromhex("001000010004080064003c00000000ff7a")
-READ = bytes.fromhex("040400a00009307b")
 
 
 async def scan(bus: Bus, scene: MasterScene) -> ScanResult:
@@ -28,7 +26,7 @@ def test_another_master_is_noticed_before_our_first_broadcast() -> None:
             changes: list[frozenset[Fault]] = []
             scene.master.subscribe(lambda: changes.append(scene.master.noticed))
             await asyncio.sleep(2.3)
-            scene.line.say(FOREIGN)
+            scene.line.say(OTHER_BROADCAST)
             await asyncio.sleep(STAY_SILENT - 1)
             assert scene.line.sent == []
             assert changes == [frozenset({Fault.SECOND_MASTER})]
@@ -40,20 +38,19 @@ def test_another_master_is_noticed_before_our_first_broadcast() -> None:
 
 
 @pytest.mark.parametrize(
-    "frame",
+    "head",
     [
-        "001000010004080064003c00000000ff7a",
+        "001000010004080064003c00000000",
         "0910000100081000640000000000000000000000000000",
         "0910002000081000640000000000000000000000000000",
     ],
 )
-def test_another_master_silences_us_at_once_for_as_long_as_it_sends(frame: str) -> None:
+def test_another_master_silences_us_at_once_for_as_long_as_it_sends(head: str) -> None:
     async def scene() -> None:
         async with MasterScene() as scene:
             await asyncio.sleep(6)
             assert scene.slave(2).available
-            data = bytes.fromhex(frame)
-            data = data if data[0] == 0 else data + crc(data)
+            data = frame(head)
             await scene.until(lambda: now() > scene.line.busy_until + 0.01)
             scene.line.say(data)
             await asyncio.sleep(0.005)
@@ -111,7 +108,7 @@ def test_our_own_echo_is_not_taken_for_another_master(late: float) -> None:
 
 
 @pytest.mark.parametrize(
-    "frame",
+    "head",
     [
         "001000010004",  # the answer to a broadcast, of a box without load balancing
         "040600030082",  # a slave that is not configured
@@ -120,12 +117,11 @@ def test_our_own_echo_is_not_taken_for_another_master(late: float) -> None:
         "000600020001",
     ],
 )
-def test_other_frames_are_not_taken_for_a_master(frame: str) -> None:
+def test_other_frames_are_not_taken_for_a_master(head: str) -> None:
     async def scene() -> None:
         async with MasterScene() as scene:
             await asyncio.sleep(6)
-            data = bytes.fromhex(frame)
-            scene.line.noise(data + crc(data))
+            scene.line.noise(frame(head))
             await asyncio.sleep(6)
             assert scene.master.noticed == frozenset()
             assert max(scene.gaps()) < 2.1
@@ -178,7 +174,7 @@ def test_a_scan_beside_another_master_sends_nothing_and_reports_it() -> None:
             scene.plug_box(2)
             looking = asyncio.create_task(scan(scene.bus, scene))
             await asyncio.sleep(1)
-            scene.line.say(FOREIGN)
+            scene.line.say(OTHER_BROADCAST)
             assert await looking == ScanResult(other_master=True)
             assert scene.line.sent == []
             assert await scan(scene.bus, scene) == ScanResult(other_master=True)
@@ -212,12 +208,3 @@ def test_a_scan_of_a_running_bus_delays_no_broadcast() -> None:
 def test_an_impossible_circuit_is_refused(circuit: Circuit) -> None:
     with pytest.raises(RefusedOrderError):
         Master(circuit)
-
-
-def crc(data: bytes) -> bytes:
-    value = 0xFFFF
-    for byte in data:
-        value ^= byte
-        for _ in range(8):
-            value = value >> 1 ^ 0xA001 if value & 1 else value >> 1
-    return value.to_bytes(2, "little")

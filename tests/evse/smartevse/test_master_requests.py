@@ -6,37 +6,11 @@ import pytest
 
 from custom_components.evse_bus.evse.model import OrderChange
 from custom_components.evse_bus.evse.smartevse.master import PERIOD
-from tests.evse.smartevse.scene import MasterScene, Sent
+from tests.evse.smartevse.frames import REQUEST_A, REQUEST_C, answers, frame
+from tests.evse.smartevse.scene import MasterScene
 from tests.simulated_time import now, simulate
 
-
-def crc(head: str) -> bytes:
-    value = 0xFFFF
-    for byte in bytes.fromhex(head):
-        value ^= byte
-        for _ in range(8):
-            value = value >> 1 ^ 0xA001 if value & 1 else value >> 1
-    return value.to_bytes(2, "little")
-
-
-def frame(head: str) -> bytes:
-    return bytes.fromhex(head) + crc(head)
-
-
-PLUGGED = bytes.fromhex("020600020082a858")
-ASKS = bytes.fromhex("020600030082f998")
-LEFT = frame("020600010000")
-ENDED = frame("020600040000")
 TO_STATE_B = "02060084"
-
-
-def answers(scene: MasterScene, since: float = 0.0) -> list[Sent]:
-    """Return the answers to requests of all units."""
-    return [
-        sent
-        for sent in scene.line.sent
-        if sent.data[1] == 6 and sent.data[2:3] == b"\x00" and sent.when >= since
-    ]
 
 
 @pytest.mark.parametrize("before", [1.0, 0.3, 0.1, 0.05, 0.03, 0.015])
@@ -46,7 +20,7 @@ def test_answered_in_time_also_right_before_a_broadcast(before: float) -> None:
             await asyncio.sleep(6)
             await asyncio.sleep(scene.master.slot.ready + PERIOD - before - now())
             asked = now()
-            scene.line.say(LEFT)
+            scene.line.say(REQUEST_A)
             await asyncio.sleep(0.5)
             (answer,) = answers(scene, asked)
             assert answer.data == frame("020600810000")
@@ -66,7 +40,7 @@ def test_answered_in_time_during_a_time_out() -> None:
                 lambda: any(s.data[0] == 3 for s in scene.line.sent[start:])
             )
             asked = now()
-            scene.line.say(LEFT)
+            scene.line.say(REQUEST_A)
             await asyncio.sleep(0.9)
             (answer,) = answers(scene, asked)
             # The time-out is 0.25 s, and counted from the end of the request.
@@ -80,9 +54,9 @@ def test_a_repeated_request_has_one_answer_each() -> None:
         async with MasterScene(units=(2,)) as scene:
             await asyncio.sleep(6)
             asked = now()
-            scene.line.say(LEFT)
+            scene.line.say(REQUEST_A)
             await asyncio.sleep(0.3)
-            scene.line.say(LEFT)
+            scene.line.say(REQUEST_A)
             await asyncio.sleep(0.3)
             assert len(answers(scene, asked)) == 2
 
@@ -120,7 +94,7 @@ def test_nothing_is_granted_to_a_box_that_may_not_charge(stops: OrderChange) -> 
             asked = now()
             scene.box(2).controller.outlet.set_access(True)
             scene.box(2).car.plug_in()
-            scene.line.say(ASKS)
+            scene.line.say(REQUEST_C)
             await asyncio.sleep(20)
             assert answers(scene, asked)
             for answer in answers(scene, asked):
@@ -219,7 +193,7 @@ def test_a_box_that_was_not_read_is_not_answered() -> None:
         async with MasterScene(units=(2,)) as scene:
             scene.box(2).deaf = True
             await asyncio.sleep(6)
-            scene.line.say(ASKS)
+            scene.line.say(REQUEST_C)
             await asyncio.sleep(2)
             assert answers(scene) == []
             # Nor is one that is not configured.
@@ -237,14 +211,14 @@ def test_no_answer_is_sent_too_late() -> None:
         async with MasterScene(units=(2,)) as scene:
             await asyncio.sleep(6)
             asked = now()
-            scene.line.say(LEFT)
+            scene.line.say(REQUEST_A)
             await asyncio.sleep(0.012)
             while now() < asked + 1.2:
                 scene.line.noise(b"\x55")
                 await asyncio.sleep(0.004)
             await asyncio.sleep(0.5)
             assert answers(scene, asked) == []
-            scene.line.say(LEFT)
+            scene.line.say(REQUEST_A)
             await asyncio.sleep(0.3)
             assert len(answers(scene, asked)) == 1
 

@@ -88,7 +88,7 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
         """Access was turned off because it kept offering this current, A."""
         self._shutting_down = False
 
-    # -- When ----------------------------------------------------------------------
+    # -- Timing --------------------------------------------------------------------
 
     @property
     @override

@@ -100,7 +100,7 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
         self._implausible_replies = 0
         self._unanswered_probes = 0
 
-    # -- What it is and has --------------------------------------------------------
+    # -- Capabilities and limits ---------------------------------------------------
 
     @property
     @override

@@ -96,7 +96,7 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
         """Requests being answered, and until when their repetition is ignored."""
         self._read_dialect_at = -inf
 
-    # -- What it is and has --------------------------------------------------------
+    # -- Capabilities and limits ---------------------------------------------------
 
     @property
     @override

@@ -15,9 +15,13 @@ from custom_components.evse_bus.evse.model import (
 )
 from custom_components.evse_bus.evse.smartevse.master import ECHO, PERIOD
 from tests.evse.smartevse.far import FarLine
+from tests.evse.smartevse.frames import (
+    OTHER_BROADCAST,
+    REQUEST_C,
+    answers,
+    frame,
+)
 from tests.evse.smartevse.scene import MasterScene
-from tests.evse.smartevse.test_master_others import FOREIGN
-from tests.evse.smartevse.test_master_requests import ASKS, answers, frame
 from tests.simulated_time import SimulatedLoop, now, simulate
 
 
@@ -102,10 +106,10 @@ def test_requests_beside_another_master_leave_no_jobs() -> None:
     async def scene() -> None:
         async with MasterScene(units=(2,)) as scene:
             await asyncio.sleep(6)
-            scene.line.say(FOREIGN)
+            scene.line.say(OTHER_BROADCAST)
             for _ in range(40):
                 await asyncio.sleep(1)
-                scene.line.say(ASKS)
+                scene.line.say(REQUEST_C)
             assert list(scene.bus._jobs) == []
 
     simulate(scene())
