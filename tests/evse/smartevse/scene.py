@@ -1,7 +1,7 @@
 """A simulated RS-485 line with SmartEVSE slaves and our master on it.
 
-The boxes are virtual ones, in simulated time; who overlaps on the wire is not heard.
-The witness is what the boxes offer with their contactors closed.
+The boxes are virtual ones, in simulated time; frames that overlap on the wire are lost.
+The oracle is the sum of what the boxes offer with their contactors closed.
 """
 
 from collections.abc import Callable
@@ -29,15 +29,20 @@ BROADCAST = bytes((0, 0x10, 0, 1))
 
 @dataclass
 class Box:
-    """A virtual slave, and what of the wire reaches it."""
+    """A virtual slave, and the losses between it and the wire."""
 
     controller: SmartEvseController
     car: Car
     deaf: bool = False
+    """It receives nothing."""
     mute: bool = False
+    """Nothing that it sends arrives."""
     delay: float = 0.008
+    """From the end of a request to its reply, s."""
     misses: Callable[[bytes], bool] = lambda _data: False
+    """Frames that it does not receive."""
     loses: Callable[[bytes], bool] = lambda _data: False
+    """Frames of it that do not arrive."""
 
     @property
     def unit(self) -> int:
@@ -45,7 +50,7 @@ class Box:
 
     @property
     def offers(self) -> float:
-        """What a car may draw now, A."""
+        """Return the current that a car may draw now, A."""
         outlet = self.controller.outlet
         return outlet.pilot_current if outlet.contactor else 0.0
 
@@ -64,14 +69,14 @@ class Sent:
         return self.data.startswith(BROADCAST)
 
     @property
-    def words(self) -> tuple[int, ...]:
-        """The values of a broadcast, 0.1 A."""
+    def values(self) -> tuple[int, ...]:
+        """Return the values of a broadcast, 0.1 A."""
         pairs = itertools.batched(self.data[7:-2], 2, strict=True)
         return tuple(int.from_bytes(bytes(pair), "big") for pair in pairs)
 
 
 class SmartEvseLine(SimulatedLine[Sent]):
-    """The wire: bytes take their time, and what overlaps is lost."""
+    """The wire: bytes take their time, and frames that overlap are lost."""
 
     def __init__(self) -> None:
         super().__init__(SETTINGS)
@@ -93,14 +98,14 @@ class SmartEvseLine(SimulatedLine[Sent]):
         self.busy_until = end
         self.loop.call_at(end, self._arrive, data, None)
 
-    def say(self, data: bytes, speaker: Box | None = None) -> None:
+    def send(self, data: bytes, sender: Box | None = None) -> None:
         """Send a frame of another station once the line was quiet for 6 ms."""
         wait = self.busy_until + 0.0061 - now()
         if wait > 0:
-            self.loop.call_later(wait, self.say, data, speaker)
+            self.loop.call_later(wait, self.send, data, sender)
             return
         self.busy_until = self.deliver(data, now())
-        self.loop.call_at(self.busy_until, self._arrive, data, speaker)
+        self.loop.call_at(self.busy_until, self._arrive, data, sender)
 
     @override
     def hear(self, data: bytes) -> None:
@@ -111,30 +116,30 @@ class SmartEvseLine(SimulatedLine[Sent]):
         """Receive bytes out of nowhere, at our end only."""
         self.hear(data)
 
-    def _arrive(self, data: bytes, speaker: Box | None) -> None:
-        """Bring a frame to all boxes but its speaker."""
+    def _arrive(self, data: bytes, sender: Box | None) -> None:
+        """Bring a frame to all boxes but its sender."""
         if now() <= self._lost_until:
             return
         for box in self.boxes.values():
-            if box is speaker or box.deaf or (speaker is None and box.misses(data)):
+            if box is sender or box.deaf or (sender is None and box.misses(data)):
                 continue
             answer = box.controller.receive(data, now())
-            self._speak_for(box)
+            self._send_for(box)
             if answer is not None and not box.mute and not box.loses(answer):
-                self.loop.call_later(box.delay, self.say, answer, box)
+                self.loop.call_later(box.delay, self.send, answer, box)
 
-    def _speak_for(self, box: Box) -> None:
+    def _send_for(self, box: Box) -> None:
         sending = box.controller.sending
         while sending:
             data = sending.pop(0)
             if not box.mute and not box.loses(data):
-                self.say(data, box)
+                self.send(data, box)
 
     def live(self) -> None:
-        """Let the boxes live until now."""
+        """Bring the boxes up to now."""
         for box in tuple(self.boxes.values()):
             box.controller.step(now())
-            self._speak_for(box)
+            self._send_for(box)
 
 
 @dataclass
@@ -155,8 +160,8 @@ class MasterScene(LiveScene):
     """Most that all boxes have offered at one moment, A."""
     overshoot: float = field(init=False, default=0.0)
     """By how much that was above the limit at worst, A."""
-    said: float = field(init=False, default=0.0)
-    """By how much the words of one broadcast were above it at worst, 0.1 A."""
+    excess: float = field(init=False, default=0.0)
+    """By how much the values of one broadcast were above it at worst, 0.1 A."""
 
     def __post_init__(self) -> None:
         self.line = SmartEvseLine()
@@ -167,7 +172,7 @@ class MasterScene(LiveScene):
             self.add(unit)
 
     def new_bus(self) -> None:
-        """Home Assistant starts anew; the boxes have lived on."""
+        """Restart the library; the boxes go on."""
         self.master = Master(Circuit(limit=self.limit, minimum=self.minimum))
         self.bus = Bus(self.line, RtuFramer(), TIMING, "simulated", group=self.master)
 
@@ -191,8 +196,8 @@ class MasterScene(LiveScene):
             address=unit,
             installation_limit=32.0,
         )
-        wish = {"limit": CurrentLimit(current=self.current), "allowed": self.allowed}
-        return SlaveSmartEvse(config, Orders(**(wish | orders)))  # type: ignore[arg-type]
+        usual = {"limit": CurrentLimit(current=self.current), "allowed": self.allowed}
+        return SlaveSmartEvse(config, Orders(**(usual | orders)))  # type: ignore[arg-type]
 
     def add(self, unit: int, **orders: object) -> SlaveSmartEvse:
         slave = self.make(unit, **orders)
@@ -219,7 +224,7 @@ class MasterScene(LiveScene):
         return [b - a for a, b in itertools.pairwise(times)]
 
     def frames(self, start: str, since: float = 0.0) -> list[str]:
-        """Return what we sent that begins like this, as hex."""
+        """Return the frames we sent that begin with these hex digits."""
         return [
             sent.data.hex()
             for sent in self.line.sent
@@ -234,10 +239,10 @@ class MasterScene(LiveScene):
 
     def _add_up(self, sent: Sent) -> None:
         if sent.is_broadcast:
-            # A box that nobody can reach is told 6 A, whatever there is.
-            lowest = 60 * sum(word > 0 for word in sent.words)
+            # A box that cannot be reached gets 6 A, whatever the limit.
+            lowest = 60 * sum(value > 0 for value in sent.values)
             limit = max(self.master.circuit.limit * 10, lowest)
-            self.said = max(self.said, sum(sent.words) - limit)
+            self.excess = max(self.excess, sum(sent.values) - limit)
 
     @override
     def step(self) -> None:
@@ -251,6 +256,6 @@ class MasterScene(LiveScene):
     async def __aexit__(self, *exc: object) -> None:
         await super().__aexit__(*exc)
         if exc[0] is None:
-            assert self.said <= 0, f"{self.said / 10:g} A too many in one broadcast"
+            assert self.excess <= 0, f"{self.excess / 10:g} A too much in a broadcast"
         if exc[0] is None and self.watch:
-            assert self.overshoot <= 1e-6, f"{self.overshoot:g} A above the supply"
+            assert self.overshoot <= 1e-6, f"{self.overshoot:g} A above the limit"

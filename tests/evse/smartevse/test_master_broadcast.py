@@ -105,7 +105,7 @@ class Trouble:
 
     async def foreign(self) -> None:
         """Send a request of a unit that is not there."""
-        self.scene.line.say(bytes.fromhex("0a0600020082a9d0"))
+        self.scene.line.send(bytes.fromhex("0a0600020082a9d0"))
 
     async def remove_or_add(self) -> None:
         gone = self.scene.bus.chargers.get("4")
@@ -177,8 +177,8 @@ def test_a_port_lost_for_a_moment() -> None:
             scene.line.unplug()
             await asyncio.sleep(8)
             assert [box.offers for box in scene.line.boxes.values()] == [8.0, 8.0]
-            words = [sent.words for sent in scene.broadcasts(now() - 14)]
-            assert set(words) == {(0, 80, 80, 0)}
+            values = [sent.values for sent in scene.broadcasts(now() - 14)]
+            assert set(values) == {(0, 80, 80, 0)}
             assert max(scene.gaps()) < 5
 
     simulate(scene())

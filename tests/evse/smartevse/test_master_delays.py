@@ -14,7 +14,7 @@ from custom_components.evse_bus.evse.model import (
     Persistence,
 )
 from custom_components.evse_bus.evse.smartevse.master import ECHO, PERIOD
-from tests.evse.smartevse.far import FarLine
+from tests.evse.smartevse.far_line import FarLine
 from tests.evse.smartevse.frames import (
     OTHER_BROADCAST,
     REQUEST_C,
@@ -94,7 +94,7 @@ def test_making_room_delays_no_broadcast(before: float) -> None:
             scene.box(2).deaf = scene.box(4).deaf = True
             statistics = scene.bus.wire.statistics
             missed, timeouts = statistics.missed_deadlines, statistics.timeouts
-            scene.line.say(frame("030600030082"))
+            scene.line.send(frame("030600030082"))
             await asyncio.sleep(1.9)
             assert statistics.missed_deadlines == missed
             assert statistics.timeouts > timeouts
@@ -106,10 +106,10 @@ def test_requests_beside_another_master_leave_no_jobs() -> None:
     async def scene() -> None:
         async with MasterScene(units=(2,)) as scene:
             await asyncio.sleep(6)
-            scene.line.say(OTHER_BROADCAST)
+            scene.line.send(OTHER_BROADCAST)
             for _ in range(40):
                 await asyncio.sleep(1)
-                scene.line.say(REQUEST_C)
+                scene.line.send(REQUEST_C)
             assert list(scene.bus._jobs) == []
 
     simulate(scene())
@@ -174,8 +174,8 @@ def test_an_older_request_is_not_answered_after_a_newer_one(before: float) -> No
             await asyncio.sleep(scene.master.slot.ready + PERIOD - before - now())
             scene.box(2).deaf = scene.box(4).deaf = True
             asked = now()
-            scene.line.say(frame("030600020082"))
-            scene.line.say(frame("030600030082"))
+            scene.line.send(frame("030600020082"))
+            scene.line.send(frame("030600030082"))
             await asyncio.sleep(1.9)
             kinds = [answer.data[3] for answer in answers(scene, asked)]
             assert kinds in ([], [0x83], [0x82], [0x82, 0x83])

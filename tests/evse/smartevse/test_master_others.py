@@ -26,7 +26,7 @@ def test_another_master_is_noticed_before_our_first_broadcast() -> None:
             changes: list[frozenset[Fault]] = []
             scene.master.subscribe(lambda: changes.append(scene.master.noticed))
             await asyncio.sleep(2.3)
-            scene.line.say(OTHER_BROADCAST)
+            scene.line.send(OTHER_BROADCAST)
             await asyncio.sleep(STAY_SILENT - 1)
             assert scene.line.sent == []
             assert changes == [frozenset({Fault.SECOND_MASTER})]
@@ -52,14 +52,14 @@ def test_another_master_silences_us_at_once_for_as_long_as_it_sends(head: str) -
             assert scene.slave(2).available
             data = frame(head)
             await scene.until(lambda: now() > scene.line.busy_until + 0.01)
-            scene.line.say(data)
+            scene.line.send(data)
             await asyncio.sleep(0.005)
             waiting = asyncio.create_task(
                 scene.slave(2).change_orders(OrderChange(current=9.0))
             )
             for _ in range(50):
                 await asyncio.sleep(2)
-                scene.line.say(data)
+                scene.line.send(data)
             first = now() - 100
             with pytest.raises(NotAvailableError, match="another master"):
                 await waiting
@@ -70,7 +70,7 @@ def test_another_master_silences_us_at_once_for_as_long_as_it_sends(head: str) -
             assert scene.master.noticed == {Fault.SECOND_MASTER}
             assert not scene.slave(2).available
             # It answers the requests of the slaves, too.
-            scene.line.say(bytes.fromhex("020600030082f998"))
+            scene.line.send(bytes.fromhex("020600030082f998"))
             await asyncio.sleep(STAY_SILENT - 5)
             assert [s for s in scene.line.sent if s.when > first + 0.02] == []
             await asyncio.sleep(10)
@@ -143,7 +143,7 @@ def test_another_dialect_is_not_written_to(dialect: str) -> None:
                 await slave.change_orders(OrderChange(current=10.0))
             assert {s.data[1] for s in scene.line.sent if s.data[0] == 3} <= {3, 4}
             # It has no share, and its value is 0.
-            assert {s.words[2] for s in scene.broadcasts()} == {0}
+            assert {s.values[2] for s in scene.broadcasts()} == {0}
             await scene.charge(2)
             await asyncio.sleep(3)
             assert scene.offers == 16
@@ -174,7 +174,7 @@ def test_a_scan_beside_another_master_sends_nothing_and_reports_it() -> None:
             scene.plug_box(2)
             looking = asyncio.create_task(scan(scene.bus, scene))
             await asyncio.sleep(1)
-            scene.line.say(OTHER_BROADCAST)
+            scene.line.send(OTHER_BROADCAST)
             assert await looking == ScanResult(other_master=True)
             assert scene.line.sent == []
             assert await scan(scene.bus, scene) == ScanResult(other_master=True)

@@ -77,7 +77,7 @@ def test_a_request_older_than_access_turned_off_at_the_box() -> None:
             scene.box(2).controller.outlet.set_access(False)
             await asyncio.sleep(3)
             asked = now()
-            scene.line.say(REQUEST_C)
+            scene.line.send(REQUEST_C)
             await asyncio.sleep(3)
             assert answers(scene, asked) == []
             assert scene.most == 0
@@ -136,7 +136,7 @@ def test_nothing_is_granted_to_a_box_withheld_for_lack_of_current() -> None:
             await scene.master.change_circuit(Circuit(limit=16.0))
             asked = now()
             scene.box(2).controller.outlet.set_access(True)
-            scene.line.say(REQUEST_C)
+            scene.line.send(REQUEST_C)
             await asyncio.sleep(10)
             assert answers(scene, asked)
             for answer in answers(scene, asked):

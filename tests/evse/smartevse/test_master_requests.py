@@ -20,7 +20,7 @@ def test_answered_in_time_also_right_before_a_broadcast(before: float) -> None:
             await asyncio.sleep(6)
             await asyncio.sleep(scene.master.slot.ready + PERIOD - before - now())
             asked = now()
-            scene.line.say(REQUEST_A)
+            scene.line.send(REQUEST_A)
             await asyncio.sleep(0.5)
             (answer,) = answers(scene, asked)
             assert answer.data == frame("020600810000")
@@ -40,7 +40,7 @@ def test_answered_in_time_during_a_time_out() -> None:
                 lambda: any(s.data[0] == 3 for s in scene.line.sent[start:])
             )
             asked = now()
-            scene.line.say(REQUEST_A)
+            scene.line.send(REQUEST_A)
             await asyncio.sleep(0.9)
             (answer,) = answers(scene, asked)
             # The time-out is 0.25 s, and counted from the end of the request.
@@ -54,9 +54,9 @@ def test_a_repeated_request_has_one_answer_each() -> None:
         async with MasterScene(units=(2,)) as scene:
             await asyncio.sleep(6)
             asked = now()
-            scene.line.say(REQUEST_A)
+            scene.line.send(REQUEST_A)
             await asyncio.sleep(0.3)
-            scene.line.say(REQUEST_A)
+            scene.line.send(REQUEST_A)
             await asyncio.sleep(0.3)
             assert len(answers(scene, asked)) == 2
 
@@ -94,7 +94,7 @@ def test_nothing_is_granted_to_a_box_that_may_not_charge(stops: OrderChange) -> 
             asked = now()
             scene.box(2).controller.outlet.set_access(True)
             scene.box(2).car.plug_in()
-            scene.line.say(REQUEST_C)
+            scene.line.send(REQUEST_C)
             await asyncio.sleep(20)
             assert answers(scene, asked)
             for answer in answers(scene, asked):
@@ -140,7 +140,7 @@ def test_room_is_made_first_and_well_within_the_second() -> None:
             sent = [s for s in scene.line.sent if s.when >= asked]
             order = [s.data.hex()[:8] for s in sent]
             lowered = next(
-                i for i, s in enumerate(sent) if s.is_broadcast and s.words[1] == 80
+                i for i, s in enumerate(sent) if s.is_broadcast and s.values[1] == 80
             )
             assert order[lowered : lowered + 3] == [
                 "00100001",
@@ -181,9 +181,9 @@ def test_the_maximum_in_a_request_limits_its_share() -> None:
             assert scene.slave(2).limits.reported == 13
             assert scene.offers == 13
             # Another car, with a cable that carries less.
-            scene.line.say(frame("02060003005a"))
+            scene.line.send(frame("02060003005a"))
             await asyncio.sleep(3)
-            assert scene.broadcasts()[-1].words == (0, 90, 0, 0)
+            assert scene.broadcasts()[-1].values == (0, 90, 0, 0)
 
     simulate(scene())
 
@@ -193,11 +193,11 @@ def test_a_box_that_was_not_read_is_not_answered() -> None:
         async with MasterScene(units=(2,)) as scene:
             scene.box(2).deaf = True
             await asyncio.sleep(6)
-            scene.line.say(REQUEST_C)
+            scene.line.send(REQUEST_C)
             await asyncio.sleep(2)
             assert answers(scene) == []
             # Nor is one that is not configured.
-            scene.line.say(frame("040600030082"))
+            scene.line.send(frame("040600030082"))
             await asyncio.sleep(2)
             assert answers(scene) == []
 
@@ -211,14 +211,14 @@ def test_no_answer_is_sent_too_late() -> None:
         async with MasterScene(units=(2,)) as scene:
             await asyncio.sleep(6)
             asked = now()
-            scene.line.say(REQUEST_A)
+            scene.line.send(REQUEST_A)
             await asyncio.sleep(0.012)
             while now() < asked + 1.2:
                 scene.line.noise(b"\x55")
                 await asyncio.sleep(0.004)
             await asyncio.sleep(0.5)
             assert answers(scene, asked) == []
-            scene.line.say(REQUEST_A)
+            scene.line.send(REQUEST_A)
             await asyncio.sleep(0.3)
             assert len(answers(scene, asked)) == 1
 

@@ -45,7 +45,7 @@ class Recording(SmartEvseLine):
             asyncio.get_running_loop().call_later(0.008, self.reply, answer)
 
     def reply(self, answer: str) -> None:
-        self.say(bytes.fromhex(answer))
+        self.send(bytes.fromhex(answer))
 
 
 def scene_with(status: str, current: float) -> tuple[MasterScene, Recording]:
@@ -90,7 +90,7 @@ def play(section: str, begin: float, end: float, current: float) -> list[str]:
                 if entry in statuses:
                     line.status = entry["hex"]
                 elif entry.get("dir") == "slave":
-                    line.say(bytes.fromhex(entry["hex"]))
+                    line.send(bytes.fromhex(entry["hex"]))
                 elif entry.get("event", "").startswith("limit"):
                     limit = int(entry["event"].split()[1]) / 10
                     # The read-back is part of the recording, later.
@@ -145,7 +145,7 @@ def test_stop_and_resume_are_those_of_the_recording() -> None:
             async def asks(what: str, then: str) -> None:
                 request, answer = by_what[what]
                 begin = now()
-                line.say(bytes.fromhex(request["slave_sent"]))
+                line.send(bytes.fromhex(request["slave_sent"]))
                 line.status = status(then)
                 await asyncio.sleep(3)
                 answers = [f for f in sent(scene, begin) if f.startswith("0206")]

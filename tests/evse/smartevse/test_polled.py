@@ -22,7 +22,7 @@ from custom_components.evse_bus.evse.smartevse import POLLED
 from custom_components.evse_bus.evse.smartevse.dialects import Dialect
 from tests.simulated_time import now, simulate
 
-from .polled import ALL, LATER, OLDER, V2_17, V2_20, PolledScene, play
+from .polled_scene import ALL, LATER, OLDER, V2_17, V2_20, PolledScene, play
 
 each = pytest.mark.parametrize("dialect", ALL)
 older = pytest.mark.parametrize("dialect", OLDER)

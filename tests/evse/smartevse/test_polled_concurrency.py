@@ -10,7 +10,7 @@ from custom_components.evse_bus.evse.errors import EvseError, SupersededError
 from custom_components.evse_bus.evse.model import Fault, OrderChange, Setting
 from custom_components.evse_bus.evse.smartevse.dialects import Dialect
 
-from .polled import ALL, PolledScene, play
+from .polled_scene import ALL, PolledScene, play
 
 each = pytest.mark.parametrize("dialect", ALL)
 

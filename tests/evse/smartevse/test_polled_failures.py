@@ -15,7 +15,7 @@ from custom_components.evse_bus.evse.smartevse.dialects import MAPS, Dialect
 from custom_components.evse_bus.evse.smartevse.registers import read_request
 from tests.simulated_time import now, simulate
 
-from .polled import ALL, LATER, OLDER, V2_17, V2_20, PolledScene, play
+from .polled_scene import ALL, LATER, OLDER, V2_17, V2_20, PolledScene, play
 
 each = pytest.mark.parametrize("dialect", ALL)
 older = pytest.mark.parametrize("dialect", OLDER)
@@ -161,7 +161,7 @@ def test_a_reload_does_not_stop_a_later_box(after: float) -> None:
     async def run() -> None:
         scene = PolledScene(LATER)
         errors: list[int] = []
-        scene.seen.append(lambda: errors.append(scene.outlet.error))
+        scene.on_step.append(lambda: errors.append(scene.outlet.error))
         async with scene:
             await scene.settled()
             await scene.charge()
@@ -184,7 +184,7 @@ def test_a_reload_does_not_stop_a_later_box(after: float) -> None:
 def test_a_scan_does_not_stop_a_later_box(after: float) -> None:
     async def acts(scene: PolledScene) -> None:
         errors: list[int] = []
-        scene.seen.append(lambda: errors.append(scene.outlet.error))
+        scene.on_step.append(lambda: errors.append(scene.outlet.error))
         await scene.charge()
         await scene.polled(5)
         last = len(scene.line.sent)

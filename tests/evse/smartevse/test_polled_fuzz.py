@@ -17,7 +17,7 @@ from custom_components.evse_bus.evse.model import MINIMUM_CURRENT, OrderChange
 from custom_components.evse_bus.evse.smartevse.dialects import MAPS, Dialect
 from tests.simulated_time import now, simulate
 
-from .polled import ALL, LATER, PolledScene, as_write
+from .polled_scene import ALL, LATER, PolledScene, as_write
 
 INSTALLATION = 20.0
 

@@ -12,7 +12,7 @@ from custom_components.evse_bus.evse.smartevse.dialects import Dialect
 from tests.evse.wires import MakeBus, each_wire
 from tests.virtual import Car, SmartEvse
 
-from .polled import V2_17
+from .polled_scene import V2_17
 
 SCALE = 10.0
 

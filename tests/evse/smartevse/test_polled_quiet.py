@@ -10,7 +10,7 @@ from custom_components.evse_bus.evse.smartevse.polled import QUIET
 from custom_components.evse_bus.evse.smartevse.registers import read_request
 from tests.simulated_time import now
 
-from .polled import LATER, PolledScene, play
+from .polled_scene import LATER, PolledScene, play
 
 NO_COMM = 2
 
@@ -54,7 +54,7 @@ def test_polled_without_quiet_it_stops_with_no_comm() -> None:
 def test_polled_by_the_library_it_does_not_stop() -> None:
     async def acts(scene: PolledScene) -> None:
         errors = []
-        scene.seen.append(lambda: errors.append(scene.outlet.error))
+        scene.on_step.append(lambda: errors.append(scene.outlet.error))
         await scene.charge()
         for current in (7, 12, 9, 10):
             await scene.charger.change_orders(OrderChange(current=current))
@@ -91,7 +91,7 @@ def test_commands_wait_for_the_quiet_but_pauses_do_not() -> None:
 def test_requests_to_other_addresses_disturb_the_quiet_too() -> None:
     async def acts(scene: PolledScene) -> None:
         errors = []
-        scene.seen.append(lambda: errors.append(scene.outlet.error))
+        scene.on_step.append(lambda: errors.append(scene.outlet.error))
         await scene.charge()
 
         async def ask(turn: Turn) -> None:

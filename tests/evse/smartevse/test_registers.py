@@ -55,7 +55,7 @@ from custom_components.evse_bus.evse.smartevse.states import (
     state_of,
 )
 
-from .polled import ALL, LATER, V2_17, V2_20
+from .polled_scene import ALL, LATER, V2_17, V2_20
 
 each = pytest.mark.parametrize("dialect", ALL)
 LIMITS = Limits(installation=80.0)

@@ -19,7 +19,7 @@ from custom_components.evse_bus.evse.model import (
 from custom_components.evse_bus.evse.smartevse.dialects import MAPS, Dialect
 from tests.simulated_time import now
 
-from .polled import ALL, LATER, OLDER, V2_17, V2_20, PolledScene, play
+from .polled_scene import ALL, LATER, OLDER, V2_17, V2_20, PolledScene, play
 
 each = pytest.mark.parametrize("dialect", ALL)
 
@@ -102,9 +102,11 @@ def test_access_that_a_setting_opens_is_closed_again(
             scene.car.plug_in()
         await scene.polled(1)
         opened: list[float] = []
-        scene.seen.append(lambda: opened.append(now()) if scene.outlet.access else None)
+        scene.on_step.append(
+            lambda: opened.append(now()) if scene.outlet.access else None
+        )
         offered: list[float] = []
-        scene.seen.append(lambda: offered.append(scene.box.offers))
+        scene.on_step.append(lambda: offered.append(scene.box.offers))
         await scene.charger.configure(Setting.MAXIMUM_CURRENT, 13)
         assert not scene.outlet.access
         assert scene.outlet.settings["max_current"] == 13

@@ -1,4 +1,4 @@
-"""The simulated line behind a network port: everything comes later, in its order."""
+"""The simulated line behind a network port: bytes arrive late, and in order."""
 
 import asyncio
 from random import Random
@@ -11,11 +11,11 @@ from tests.simulated_time import now
 MERGES = 0.003
 """A pause that does not end a frame, s."""
 SPIKES = 0.004
-"""Part of the bytes that have another delay."""
+"""Share of the bytes with another delay."""
 
 
 class FarLine(SmartEvseLine):
-    """Both ways have a delay, and some bytes up to ``jitter`` more, s."""
+    """Both directions have a delay, and some bytes up to ``jitter`` more, s."""
 
     def __init__(self, delay: float, jitter: float, dice: Random) -> None:
         super().__init__()
@@ -26,7 +26,7 @@ class FarLine(SmartEvseLine):
 
     def _late(self, after: float) -> float:
         spike = self._dice.random() < SPIKES and self.jitter * self._dice.random()
-        # Timers of the same moment have no order among them.
+        # Timers of the same moment run in no order.
         return max(after + 1e-6, now() + self.delay + spike)
 
     @override

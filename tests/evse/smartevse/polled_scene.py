@@ -1,4 +1,4 @@
-"""A simulated line with one SmartEVSE that is polled; the wire is the witness."""
+"""A simulated line with one SmartEVSE that is polled; the wire is the oracle."""
 
 import asyncio
 from collections.abc import Callable
@@ -28,7 +28,7 @@ V2_20 = Dialect.V2_20
 
 @dataclass(frozen=True)
 class Write:
-    """One register that was written."""
+    """A write of one register."""
 
     when: float
     unit: int
@@ -60,7 +60,7 @@ class PolledScene(LiveScene):
     car: Car = field(init=False)
     box: Box = field(init=False)
     charger: PolledSmartEvse = field(init=False)
-    seen: list[Callable[[], None]] = field(default_factory=list)
+    on_step: list[Callable[[], None]] = field(default_factory=list)
     """Called at each step of the simulated time."""
 
     def __post_init__(self) -> None:
@@ -115,7 +115,7 @@ class PolledScene(LiveScene):
         self.box = self.make_box(dialect)
         self.line.boxes[0] = self.box
 
-    # -- What is to be seen --------------------------------------------------------
+    # -- Observations --------------------------------------------------------------
 
     @property
     def outlet(self):  # type: ignore[no-untyped-def] # noqa: ANN201 - the virtual one
@@ -131,7 +131,7 @@ class PolledScene(LiveScene):
         return self.reading.connectors[1]
 
     def writes(self, register: int | None = None, since: float = 0.0) -> list[Write]:
-        """Return what was written on the wire, one register a frame."""
+        """Return the writes on the wire, one register a frame."""
         return [
             write
             for sent in self.line.sent
@@ -153,7 +153,7 @@ class PolledScene(LiveScene):
     # -- Time ----------------------------------------------------------------------
 
     async def settled(self) -> None:
-        """Wait until it is known and has nothing more to say."""
+        """Wait until the box is known and no conversation is under way."""
         await self.until(
             lambda: (
                 self.charger.reading is not None
@@ -179,12 +179,12 @@ class PolledScene(LiveScene):
     @override
     def step(self) -> None:
         self.line.live()
-        for look in self.seen:
-            look()
+        for call in self.on_step:
+            call()
 
 
 def as_write(when: float, data: bytes) -> Write | None:
-    """Read a request as the wire has it: function 0x10, one register."""
+    """Return the write in a request (function 0x10); ``None``: it is a read."""
     if data[1] != 0x10:
         assert data[1] in (3, 4), f"{data.hex()} neither reads nor writes"
         return None
@@ -198,7 +198,7 @@ def as_write(when: float, data: bytes) -> Write | None:
 
 
 def play(scene: PolledScene, acts: Callable[[PolledScene], object]) -> PolledScene:
-    """Run what happens in simulated time."""
+    """Run a scene in simulated time."""
 
     async def run() -> None:
         async with scene:
