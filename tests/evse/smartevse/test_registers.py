@@ -370,7 +370,7 @@ def test_a_dialect_is_found_only_by_its_own_registers(
 def test_a_without_access_is_not_unplugged() -> None:
     status = decode_status(V2_17, words(0x41, 0, 16, 6, 0, 0, 130, 0, 0))
     assert not shows_plug(V2_17, status)
-    assert ocpp_status(V2_17, status) is OcppStatus.UNAVAILABLE
+    assert ocpp_status(V2_17, status) is OcppStatus.OUT_OF_SERVICE
     assert is_stopped(V2_17, status)
     assert offered(V2_17, status) == 0
     assert shows_plug(V2_17, replace(status, access=True))

@@ -107,7 +107,7 @@ def offered(dialect: Dialect, status: Status) -> float | None:
 def ocpp_status(dialect: Dialect, status: Status) -> OcppStatus:
     """Return the state as a status of OCPP.
 
-    ``A`` without access is "unavailable": a car may be plugged in or not. An error
+    ``A`` without access is out of service: a car may be plugged in or not. An error
     that stops the box is a fault; a lack of current or sun is a pause.
     """
     if status.faults & _STOPPED_BY:

@@ -1,4 +1,4 @@
-"""A polled SmartEVSE end to end: a real line, a virtual box, real time."""
+"""A polled SmartEVSE end to end: the library's bus and a virtual box."""
 
 import asyncio
 from collections.abc import Callable
