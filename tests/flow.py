@@ -24,7 +24,7 @@ from homeassistant.data_entry_flow import (
     section,
 )
 from homeassistant.helpers import config_validation as cv
-from homeassistant.helpers.selector import SelectSelector
+from homeassistant.helpers.selector import NumberSelector, SelectSelector
 import probatio as vol
 
 from custom_components.evse_bus.const import DOMAIN, SUBENTRY_CHARGER
@@ -48,6 +48,12 @@ IMPOSED = {
 @cache
 def english() -> dict[str, Any]:
     return json.loads(ENGLISH.read_text())
+
+
+def has_range(text: str, lowest: float, highest: float) -> bool:
+    """Return whether a text names both ends of a range."""
+    numbers = {float(number) for number in re.findall(r"\d+(?:\.\d+)?", text)}
+    return {float(lowest), float(highest)} <= numbers
 
 
 class Flow:
@@ -241,6 +247,10 @@ class Flow:
             ):
                 labels = english()["selector"][key]["options"]
                 assert set(field.config["options"]) <= set(labels)
+            if isinstance(field, NumberSelector):
+                # Home Assistant refuses what is outside, in words of its own.
+                text = texts["data_description"][key.schema]
+                assert has_range(text, field.config["min"], field.config["max"]), text
 
     def _text(self, text: str, given: Mapping[str, str]) -> None:
         wanted = set(re.findall(r"{(\w+)}", text))

@@ -1,10 +1,15 @@
 """The automations of the documentation, as they stand there."""
 
+import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from dataclasses import dataclass
 from datetime import timedelta
+import logging
+from math import floor
 from pathlib import Path
 import re
+from typing import Any
 
 from homeassistant.core import HomeAssistant
 from homeassistant.setup import async_setup_component
@@ -13,24 +18,59 @@ from homeassistant.util.yaml import parse_yaml
 import pytest
 from pytest_homeassistant_custom_component.common import async_fire_time_changed
 
-from tests.common import call, get_entity, running, wait_for_state
+from tests.common import call, get_entity, running, state_of, wait_for_state
+from tests.odd_boxes import ODD_BOXES, OddBox
 from tests.virtual import AblBox, Car, EwsBox, EwsCard, VirtualBus
 
 ROOT = Path(__file__).parents[1]
+
+
+PAGES = ("README.md", *(f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")))
+RUN_HERE = {
+    *("Charge from the sun", "Spare the main fuse", "Answer a start request"),
+    "Accept a card of another format",
+}
+"""Aliases of the automations that this module runs."""
+
+
+WITH_A_START = [kind for kind in ODD_BOXES if "socket" not in kind]
+
+
+def blocks(page: str) -> list[dict[str, Any]]:
+    """Return the YAML blocks of a page."""
+    text = (ROOT / page).read_text()
+    found = re.findall(r"```ya?ml\n(.*?)```", text, re.DOTALL)
+    return [parse_yaml(block) for block in found]
+
+
+async def test_every_block_is_run_here(hass: HomeAssistant) -> None:
+    """An automation by its alias; what else there is, Home Assistant takes."""
+    found = [block for page in PAGES for block in blocks(page)]
+    assert sorted(block["alias"] for block in found if "alias" in block) == sorted(
+        RUN_HERE
+    )
+    others = [block for block in found if "alias" not in block]
+    assert [list(block) for block in others] == [["logger"]]
+    for block in others:
+        assert await async_setup_component(hass, "logger", block)
 
 
 @asynccontextmanager
 async def automated(
     hass: HomeAssistant, alias: str, page: str = "README.md"
 ) -> AsyncIterator[None]:
-    """Run one of a page's automations."""
-    text = (ROOT / page).read_text()
-    blocks = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
-    (wanted,) = (
-        parsed
-        for block in blocks
-        if (parsed := parse_yaml(block)).get("alias") == alias
-    )
+    """Run one of a page's automations; none of its runs may stop in the middle."""
+    assert alias in RUN_HERE
+    (wanted,) = (block for block in blocks(page) if block.get("alias") == alias)
+    failed: list[str] = []
+
+    class Failures(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            failed.append(record.getMessage())
+
+    handler = Failures(logging.ERROR)
+    logger = logging.getLogger("homeassistant.components.automation")
+    logger.addHandler(handler)
     assert await async_setup_component(hass, "automation", {"automation": wanted})
     await hass.async_block_till_done()
     (automation,) = hass.states.async_all("automation")
@@ -40,37 +80,101 @@ async def automated(
     finally:
         await hass.async_block_till_done()
         await call(hass, "automation.turn_off", automation.entity_id)
+        logger.removeHandler(handler)
+    assert not failed
 
 
-@pytest.mark.parametrize(
-    ("export", "amperes"),
-    [(-7000, None), (-2760, 6), (-2070, 7), (0, 10), (1400, 12), (9000, 16)],
-)
-async def test_charge_from_the_sun(
-    hass: HomeAssistant, export: float, amperes: int | None
-) -> None:
-    """At 10 A the house has this much to give away (W)."""
-    box = AblBox(1)
-    async with running(hass, box, title="Carport") as (entry, bus):
-        limit = await get_entity(hass, "number", entry, "charging_current")
-        allowed = await get_entity(hass, "switch", entry, "charging_allowed")
-        assert (limit, allowed) == (
-            "number.carport_charging_current",
-            "switch.carport_charging_allowed",
+@dataclass
+class Carport:
+    """A charger called Carport, with a car that charges if it may."""
+
+    hass: HomeAssistant
+    bus: VirtualBus
+    odd: OddBox
+    car: Car
+    installation: float
+    limit: str = "number.carport_charging_current"
+    allowed: str = "switch.carport_charging_allowed"
+    reason: str = "sensor.carport_pause_reason"
+
+    async def order(self, current: float) -> None:
+        await call(self.hass, "number.set_value", self.limit, value=current)
+        await self.settles(current)
+
+    async def settles(self, current: float) -> None:
+        """Wait until an order stands, and the car draws what it may by it."""
+        odd = self.odd
+        kept = str(float(odd.kept(current)))
+        await wait_for_state(self.hass, self.limit, kept)
+        await wait_for_state(
+            self.hass, self.reason, odd.reason(current, self.installation)
         )
-        await call(hass, "number.set_value", limit, value=10)
-        await call(hass, "switch.turn_on", allowed)
-        hass.states.async_set("sensor.grid_export_power", str(export))
+        draws = odd.offers(current, self.installation)
+        await self.bus.wait_for_async(
+            lambda: draws - 0.2 < self.car.current <= draws, timeout=100
+        )
+        assert state_of(self.hass, self.allowed) == "on"
+
+
+@asynccontextmanager
+async def carport(
+    hass: HomeAssistant, odd: OddBox, installation: float = 16.0
+) -> AsyncIterator[Carport]:
+    car = Car(max_current=32, reaction=0.0, ramp=0.1)
+    # Only a pause of ours may stop it.
+    car.min_current = 0
+    async with running(
+        hass,
+        odd.make(car),
+        title="Carport",
+        installation_limit=installation,
+        **odd.data,
+    ) as (entry, bus):
+        port = Carport(hass, bus, odd, car, installation)
+        limit = await get_entity(hass, "number", entry, f"{odd.port}charging_current")
+        assert limit == port.limit
+        car.plug_in()
+        # Long enough for every box to see the car.
+        await asyncio.sleep(15)
+        await call(hass, "switch.turn_on", port.allowed)
+        yield port
+
+
+@pytest.mark.parametrize("kind", WITH_A_START)
+@pytest.mark.parametrize("installation", [6.0, 13.7, 32.0])
+async def test_charge_from_the_sun(
+    hass: HomeAssistant, kind: str, installation: float
+) -> None:
+    """With every box, whatever it can do: the limit follows the sun."""
+    odd = ODD_BOXES[kind]
+    async with carport(hass, odd, installation) as port:
+        order = min(10.0, installation)
+        await port.order(order)
         async with automated(hass, "Charge from the sun"):
-            minute = dt_util.utcnow().replace(second=0, microsecond=600_000)
-            async_fire_time_changed(hass, minute + timedelta(minutes=1))
-            if amperes is None:
-                await wait_for_state(hass, allowed, "off")
-                await bus.wait_for_async(lambda: box.ic_amps == 0)
-                return
-            await wait_for_state(hass, limit, str(float(amperes)))
-            await wait_for_state(hass, allowed, "on")
-            await bus.wait_for_async(lambda: amperes - 0.06 < box.ic_amps <= amperes)
+            time = dt_util.utcnow().replace(second=0, microsecond=600_000)
+            for export in (0, 1400, 9000, -2760, -2070, -9000, 3000, 16000, -690):
+                hass.states.async_set("sensor.grid_export_power", str(export))
+                now = odd.kept(order) if odd.offers(order, installation) else 0
+                order = max(0, min(floor(now + export / 690), installation))
+                time += timedelta(minutes=1)
+                async_fire_time_changed(hass, time)
+                await hass.async_block_till_done()
+                await port.settles(order)
+
+
+@pytest.mark.parametrize("kind", WITH_A_START)
+@pytest.mark.parametrize("installation", [6.0, 13.7, 32.0])
+async def test_spare_the_main_fuse_with_every_box(
+    hass: HomeAssistant, kind: str, installation: float
+) -> None:
+    async with carport(hass, ODD_BOXES[kind], installation) as port:
+        await port.order(installation)
+        hass.states.async_set("sensor.main_current_l1", "20")
+        async with automated(hass, "Spare the main fuse"):
+            hass.states.async_set("sensor.main_current_l1", "24.5")
+            await hass.async_block_till_done()
+            await port.settles(6)
+            assert port.car.current <= 6
 
 
 async def test_spare_the_main_fuse(hass: HomeAssistant) -> None:

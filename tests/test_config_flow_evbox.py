@@ -75,6 +75,7 @@ async def test_single_evbox_is_found_with_confirmed_values_only(
                 "voltage": 230,
                 "command": "68",
                 "information": "00" * 16,
+                "one_phase_modules": False,
             },
         }
         await flow.submit(charger("Garage", 20, fail_safe_timeout=90))
@@ -223,7 +224,11 @@ async def test_evbox_typed_in_without_a_word_on_the_wire(hass: HomeAssistant) ->
             charger(
                 "Two",
                 fail_safe_timeout=60,
-                expert={"command": "68", "information": "0a" * 16},
+                expert={
+                    "command": "68",
+                    "information": "0a" * 16,
+                    "one_phase_modules": True,
+                },
             )
         )
         await flow.submit()
@@ -232,6 +237,7 @@ async def test_evbox_typed_in_without_a_word_on_the_wire(hass: HomeAssistant) ->
     assert one.data["address"] == 1923054
     assert two.data["command"] == 68
     assert two.data["information"] == "0A" * 16
+    assert two.data["one_phase_modules"] is True
 
 
 async def test_the_only_evbox_may_stay_without_its_serial_number(

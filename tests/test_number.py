@@ -14,8 +14,8 @@ from tests.common import (
     running,
     state_of,
     wait_for_state,
-    wait_until,
 )
+from tests.odd_boxes import ODD_BOXES
 from tests.virtual import AblBox, Car, EvboxChargePoint, orders_in
 
 
@@ -41,10 +41,10 @@ async def test_a_limit_is_on_the_box_when_the_service_returns(
 @pytest.mark.parametrize(
     ("value", "where"),
     [
-        *((nan, 16), (inf, 16), (-inf, 16), (-6, 16), (10000, 16), (5, 16)),
-        *((-1, 16), (0, 16), (5.9, 16), (16.1, 16)),
+        *((nan, 16), (inf, 16), (-inf, 16), (-6, 16), (10000, 16)),
+        *((-1, 16), (-0.1, 16), (16.1, 16)),
         # As templates bring it.
-        *(("nan", 16), ("inf", 16), ("-1", 16), ("1e4", 16), ("5.9", 16)),
+        *(("nan", 16), ("inf", 16), ("-1", 16), ("1e4", 16), ("16.1", 16)),
     ],
 )
 async def test_absurd_values_are_refused(
@@ -147,12 +147,23 @@ async def test_evbox_limits_per_phase(hass: HomeAssistant) -> None:
         await call(hass, "number.set_value", phase, value=10)
         assert box.limits_in_force == (16.5, 10, 16.5)
         assert state_of(hass, phase) == "10.0"
-        await call(hass, "number.set_value", phase, value=0)
-        assert box.limits_in_force == (16.5, 0, 16.5)
-        with pytest.raises(ServiceValidationError) as refused:
-            await call(hass, "number.set_value", phase, value=3)
-        assert "minimum" in str(refused.value)
-        assert box.limits_in_force == (16.5, 0, 16.5)
+        reason = await get_entity(hass, "sensor", entry, "pause_reason")
+        assert state_of(hass, reason) == "none"
+        # One phase below the minimum: no manual says what a box does with that.
+        for low in (0, 3):
+            await call(hass, "number.set_value", phase, value=low)
+            assert box.limits_in_force == (0, 0, 0)
+            assert state_of(hass, phase) == str(float(low))
+            await wait_for_state(hass, reason, "limit_too_low")
+        assert state_of(hass, limit) == "16.5"
+        # The user has modules of one phase each: that phase alone is off, at once.
+        [subentry] = entry.subentries.values()
+        hass.config_entries.async_update_subentry(
+            entry, subentry, data={**subentry.data, "one_phase_modules": True}
+        )
+        await bus.wait_for_async(lambda: box.limits_in_force == (16.5, 0, 16.5))
+        await wait_for_state(hass, reason, "none")
+        assert bus.opened == 1
         assert max(max(limits) for limits in sent(bus)) == 16.5
 
 
@@ -177,16 +188,54 @@ async def test_evbox_fail_safe_values(hass: HomeAssistant) -> None:
         assert state_of(hass, timeout) == "90"
 
 
-async def test_evbox_range_follows_the_connection(hass: HomeAssistant) -> None:
+# -- The range stands, whatever charger and cable can do ---------------------------
+
+
+def range_of(hass: HomeAssistant, limit: str) -> tuple[float, float, float]:
+    """Return what Home Assistant lets through: from, to, step."""
+    attributes = hass.states.get(limit).attributes
+    return attributes["min"], attributes["max"], attributes["step"]
+
+
+@pytest.mark.parametrize("kind", ODD_BOXES)
+@pytest.mark.parametrize("installation", [6.0, 13.7, 32.0])
+async def test_any_current_within_the_installation_limit_is_taken(
+    hass: HomeAssistant, kind: str, installation: float
+) -> None:
+    odd = ODD_BOXES[kind]
+    async with running(
+        hass, odd.make(Car()), installation_limit=installation, **odd.data
+    ) as (entry, _):
+        limit = await get_entity(hass, "number", entry, f"{odd.port}charging_current")
+        reason = await get_entity(hass, "sensor", entry, f"{odd.port}pause_reason")
+        allowed = await get_entity(hass, "switch", entry, f"{odd.port}charging_allowed")
+        standing = state_of(hass, allowed)
+        assert range_of(hass, limit) == (0, installation, odd.step)
+        for asked in (installation, 6, 5.9, 0, min(15, installation), 3, installation):
+            await call(hass, "number.set_value", limit, value=asked)
+            assert state_of(hass, limit) == str(float(odd.kept(asked)))
+            await wait_for_state(hass, reason, odd.reason(asked, installation))
+            assert range_of(hass, limit) == (0, installation, odd.step)
+            assert state_of(hass, allowed) == standing
+        for absurd in (installation + 0.1, -0.1):
+            with pytest.raises(ServiceValidationError):
+                await call(hass, "number.set_value", limit, value=absurd)
+
+
+async def test_evbox_clamps_to_its_connection(hass: HomeAssistant) -> None:
     box = EvboxChargePoint(1923054, 1, max_current=12.0, min_interval=0)
     async with running(hass, box, poll_interval=0.5, installation_limit=32.0) as (
         entry,
-        _,
+        bus,
     ):
         limit = await get_entity(hass, "number", entry, "charging_current")
-        await wait_until(hass, lambda: hass.states.get(limit).attributes["max"] == 12)
-        with pytest.raises(ServiceValidationError):
-            await call(hass, "number.set_value", limit, value=16)
+        maximum = await get_entity(hass, "sensor", entry, "maximum_current")
+        await wait_for_state(hass, maximum, "12.0")
+        await call(hass, "number.set_value", limit, value=16)
+        # The order stands; the box gets what its connection carries.
+        assert state_of(hass, limit) == "16.0"
+        assert box.limits_in_force == (12, 12, 12)
+        assert max(max(limits) for limits in sent(bus)) == 12
 
 
 async def test_a_charger_that_does_not_follow(hass: HomeAssistant) -> None:

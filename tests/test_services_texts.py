@@ -27,7 +27,7 @@ from custom_components.evse_bus.evse.ews.wire.answers import Refusal
 from custom_components.evse_bus.evse.ews.wire.cards import ENTRIES, LARGEST
 from custom_components.evse_bus.evse.ews.wire.commands import PortLeds, set_leds
 from custom_components.evse_bus.services import ACTIONS
-from tests.flow import english
+from tests.flow import english, has_range
 
 from .services import WRITERS
 
@@ -125,6 +125,20 @@ def number_fields(name: str) -> list[tuple[str, dict[str, Any]]]:
         for key, field in fields_of(name).items()
         if "number" in field["selector"]
     ]
+
+
+def test_the_texts_of_numbers_name_their_ranges(subtests: pytest.Subtests) -> None:
+    for name in ACTIONS:
+        for key, bounds in number_fields(name):
+            text = english()["services"][name]["fields"][key]["description"]
+            with subtests.test(key=f"{name}.{key}"):
+                assert has_range(text, bounds["min"], bounds["max"]), text
+    entry = fields_of("write_card_list")["entries"]["selector"]["object"]
+    texts = english()["selector"][entry["translation_key"]]["fields"]
+    for key, field in entry["fields"].items():
+        if (bounds := field["selector"].get("number")) is not None:
+            text = texts[key]["description"]
+            assert has_range(text, bounds["min"], bounds["max"]), text
 
 
 def test_the_form_has_the_bounds_of_what_is_taken(subtests: pytest.Subtests) -> None:

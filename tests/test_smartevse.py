@@ -67,8 +67,12 @@ async def test_a_limit_is_what_the_car_is_offered(hass: HomeAssistant) -> None:
         # It began with its own 13 A; the order is what was confirmed at first.
         await wait_for_state(hass, offered, "6.0")
         assert state_of(hass, limit) == "6.0"
-        # Its own maximum, although cable and wiring carry more.
-        assert hass.states.get(limit).attributes["max"] == 13.0
+        # What may be asked is the user's; what is offered is the box's own maximum.
+        assert hass.states.get(limit).attributes["max"] == 16.0
+        await call(hass, "number.set_value", limit, value=16)
+        await bus.wait_for_async(lambda: box.pilot_current == 13)
+        assert state_of(hass, limit) == "16.0"
+        await wait_for_state(hass, offered, "13.0")
         await call(hass, "number.set_value", limit, value=10.5)
         await bus.wait_for_async(lambda: box.pilot_current == 10.5)
         assert state_of(hass, offered) == "10.5"
@@ -222,7 +226,7 @@ async def test_a_setting_is_written_once(hass: HomeAssistant) -> None:
         assert state_of(hass, highest) == "15"
         # Such a write opens access: it is closed again.
         assert not box.access
-        await wait_for_state(hass, limit, lambda state: state.attributes["max"] == 15.0)
+        assert hass.states.get(limit).attributes["max"] == 16
         for absurd in (float("nan"), 17):
             with pytest.raises(ServiceValidationError):
                 await call(hass, "number.set_value", highest, value=absurd)
@@ -247,15 +251,18 @@ async def test_minimum_and_maximum_do_not_cross(hass: HomeAssistant) -> None:
 
 @pytest.mark.usefixtures("all_entities_enabled")
 async def test_minimum_above_the_maximum_can_be_put_right(hass: HomeAssistant) -> None:
-    """Somebody has set that at the box: no car can charge, and the error says so."""
+    """Somebody has set that at the box: no car can charge, and the reason is shown."""
     box = SmartEvse(max_current=10, settings={"min_current": 14})
-    async with running(hass, box) as (entry, _):
+    async with running(hass, box) as (entry, bus):
         limit = await get_entity(hass, "number", entry, "charging_current")
         lowest = await get_entity(hass, "number", entry, "setting_minimum_current")
-        with pytest.raises(ServiceValidationError, match="below the minimum 14 A"):
-            await call(hass, "number.set_value", limit, value=10)
-        await call(hass, "number.set_value", lowest, value=6)
+        reason = await get_entity(hass, "sensor", entry, "pause_reason")
         await call(hass, "number.set_value", limit, value=10)
+        assert not box.access
+        await wait_for_state(hass, reason, "maximum_too_low")
+        await call(hass, "number.set_value", lowest, value=6)
+        await wait_for_state(hass, reason, "none")
+        await bus.wait_for_async(lambda: box.access)
         assert state_of(hass, limit) == "10.0"
 
 

@@ -1,7 +1,9 @@
 """Numbers: limits, fail-safe values, settings of a box, the shared supply.
 
 Limits show orders, never readings: a slider that followed the current on offer would
-go down with it and not come up again.
+go down with it and not come up again. Their range is what the user has set up and
+nothing else: Home Assistant refuses a value outside it, so an automation must be able
+to rely on it, whatever charger and cable can do at the moment.
 """
 
 from collections.abc import Callable, Hashable, Iterable
@@ -53,17 +55,6 @@ SHORTEST_STEP: Final = 0.1
 FAIL_SAFE_CURRENT: Final = "fail_safe_current"
 
 
-def ceiling(limits: Limits) -> float:
-    """Return the highest current that can be ordered, A.
-
-    A maximum that the charger has not reported yet is left out: until it has, 6 A is
-    sent, whatever the order.
-    """
-    if limits.reported is None:
-        return limits.installation
-    return min(limits.installation, limits.reported)
-
-
 @dataclass(frozen=True, kw_only=True)
 class OrderNumberDescription(NumberEntityDescription):
     """Description of one number of a charger's orders."""
@@ -71,8 +62,8 @@ class OrderNumberDescription(NumberEntityDescription):
     exists: Callable[[Charger], bool] = lambda _charger: True
     value: Callable[[Orders, Limits], float]
     change: Callable[[float], OrderChange]
-    lowest: Callable[[Limits], float] = lambda _limits: 0.0
-    highest: Callable[[Limits], float] = ceiling
+    lowest: float = 0.0
+    highest: Callable[[Limits], float] = lambda limits: limits.installation
     finest: Callable[[Limits], float] = lambda limits: max(limits.step, SHORTEST_STEP)
 
 
@@ -89,9 +80,9 @@ def _one_phase(index: int, value: float) -> Phases[float | None]:
 
 
 def _limit_of(index: int, limit: CurrentLimit, limits: Limits) -> float:
-    """Return the limit of a phase; without one of its own, the ceiling."""
+    """Return the limit of a phase; without one of its own, the installation's."""
     own = limit.phases[index]
-    return ceiling(limits) if own is None else min(own, ceiling(limits))
+    return limits.installation if own is None else min(own, limits.installation)
 
 
 def _has(capability: Capability) -> Callable[[Charger], bool]:
@@ -142,11 +133,9 @@ NUMBERS: Final[tuple[OrderNumberDescription, ...]] = (
     OrderNumberDescription(
         key="charging_current",
         translation_key="charging_current",
-        value=lambda orders, limits: min(orders.limit.current, ceiling(limits)),
+        # The installation limit may have been lowered below the order.
+        value=lambda orders, limits: min(orders.limit.current, limits.installation),
         change=lambda value: OrderChange(current=value),
-        # The minimum of a box may be above its ceiling: then an order is refused, with
-        # the reason.
-        lowest=lambda limits: min(limits.minimum, ceiling(limits)),
         **_CURRENT,
     ),
     *(_phase_limit(index) for index in range(3)),
@@ -155,7 +144,7 @@ NUMBERS: Final[tuple[OrderNumberDescription, ...]] = (
         translation_key="fail_safe_current",
         entity_category=EntityCategory.CONFIG,
         exists=falls_back,
-        value=lambda orders, limits: min(orders.fail_safe.current, ceiling(limits)),
+        value=lambda orders, limits: min(orders.fail_safe.current, limits.installation),
         change=lambda value: OrderChange(fail_safe_current=value),
         **_CURRENT,
     ),
@@ -173,7 +162,7 @@ NUMBERS: Final[tuple[OrderNumberDescription, ...]] = (
         change=lambda value: OrderChange(
             fail_safe_timeout=int(number(value, "fail-safe time-out"))
         ),
-        lowest=lambda _limits: 1,
+        lowest=1,
         highest=lambda _limits: LONGEST_TIMEOUT,
         finest=lambda _limits: 1,
     ),
@@ -297,10 +286,10 @@ class OrderNumber(ChargerEntity, NumberEntity):
         order = self._order
         limits = self.charger.limits
         self._attr_native_value = order.value(self.charger.effective_orders, limits)
-        self._attr_native_min_value = order.lowest(limits)
+        self._attr_native_min_value = order.lowest
         self._attr_native_max_value = order.highest(limits)
         self._attr_native_step = order.finest(limits)
-        return (self._attr_native_value, limits)
+        return (self._attr_native_value, limits.installation)
 
     @override
     async def async_set_native_value(self, value: float) -> None:

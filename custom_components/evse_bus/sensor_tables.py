@@ -25,10 +25,19 @@ from homeassistant.util import dt as dt_util
 from .evse.bus import Bus
 from .evse.charger import Charger
 from .evse.ews import Listener
-from .evse.model import Capability, FailSafe, Fault, Phases, SessionResult, Status
+from .evse.model import (
+    Capability,
+    FailSafe,
+    Fault,
+    PauseReason,
+    Phases,
+    SessionResult,
+    Status,
+)
 from .evse.readings import ChargerReading, ConnectorReading
 
 NO_FAULT: Final = "none"
+NO_PAUSE: Final = "none"
 
 WAITING: Final = frozenset({Fault.LESS_6A, Fault.NO_CURRENT, Fault.NO_SUN})
 """Reported among the faults of a box, but none: it waits for current or the sun."""
@@ -302,6 +311,13 @@ CHARGER_SENSORS: Final[tuple[ChargerSensorDescription, ...]] = (
         options=[str(one) for one in FailSafe],
         value=lambda charger: charger.fail_safe,
         of_box=True,
+    ),
+    ChargerSensorDescription(
+        key="pause_reason",
+        translation_key="pause_reason",
+        device_class=SensorDeviceClass.ENUM,
+        options=[NO_PAUSE, *(str(reason) for reason in PauseReason)],
+        value=lambda charger: charger.pause_reason or NO_PAUSE,
     ),
 )
 

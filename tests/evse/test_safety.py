@@ -1,6 +1,7 @@
 """From a wish to a set-point: what may never come out, whatever goes in."""
 
 import ast
+from dataclasses import replace
 from decimal import Decimal
 from math import inf, nan
 from pathlib import Path
@@ -16,6 +17,7 @@ from custom_components.evse_bus.evse.model import (
     Limits,
     OrderChange,
     Orders,
+    PauseReason,
 )
 from custom_components.evse_bus.evse.safety import (
     MAXIMUM_TIMEOUT,
@@ -24,6 +26,7 @@ from custom_components.evse_bus.evse.safety import (
     clamp,
     expired,
     number,
+    pause_reason,
     round_down,
 )
 
@@ -47,6 +50,7 @@ limits = st.builds(
     reported=st.none() | st.floats(0, 80),
     minimum=st.floats(6, 32),
     step=st.sampled_from((0.1, 0.5, 1.0)),
+    phases_alone=st.booleans(),
 )
 changes = st.builds(
     OrderChange,
@@ -122,6 +126,130 @@ def test_what_is_stored_before_sending_is_below_both(
             assert lower <= higher
 
 
+# -- What may be asked: the range is the installation's, and nothing else ---------
+
+
+@given(limits, st.data())
+def test_every_current_within_the_installation_limit_is_taken(
+    limits: Limits, data: st.DataObject
+) -> None:
+    """Whatever charger and cable can do: a guard's request is never refused."""
+    within = st.floats(0, limits.installation)
+    current, one, two, three, back = (data.draw(within) for _ in range(5))
+    taken = check_change(
+        OrderChange(
+            current=current,
+            phases=(one, two, three),
+            fail_safe_current=back,
+            fail_safe_phases=(three, None, one),
+        ),
+        limits,
+    )
+    assert taken.current == round_down(current, limits.step)
+    assert taken.phases == tuple(
+        round_down(value, limits.step) for value in (one, two, three)
+    )
+    assert taken.fail_safe_current == round_down(back, limits.step)
+    # No cable, no box and no minimum makes a difference.
+    bare = Limits(installation=limits.installation, step=limits.step)
+    assert check_change(OrderChange(current=current), bare).current == taken.current
+
+
+@given(st.floats(6, 80), st.floats(0.001, 100))
+def test_more_than_the_installation_limit_is_refused(
+    installation: float, more: float
+) -> None:
+    limits = Limits(installation=installation)
+    for change in (
+        OrderChange(current=installation + more),
+        OrderChange(phases=(None, installation + more, None)),
+        OrderChange(fail_safe_current=installation + more),
+    ):
+        with pytest.raises(RefusedOrderError, match="above"):
+            check_change(change, limits)
+
+
+@given(orders, orders, limits)
+def test_lower_orders_are_never_more_current(
+    one: Orders, other: Orders, limits: Limits
+) -> None:
+    """A limit below the minimum, of one phase or of all, is no exception."""
+    lowered = clamp(cautious(one, other), limits)
+    for lower, higher in (
+        *zip(lowered.currents, clamp(one, limits).currents, strict=True),
+        *zip(lowered.fail_safe, clamp(one, limits).fail_safe, strict=True),
+    ):
+        assert lower <= higher
+
+
+@given(orders, limits, st.floats(0, 80), st.floats(0, 80))
+def test_what_carries_less_is_never_more_current(
+    orders: Orders, limits: Limits, cable: float, minimum: float
+) -> None:
+    before = clamp(orders, limits).currents
+    lower = replace(limits, reported=min(limits.ceiling, cable))
+    needs_more = replace(limits, minimum=max(limits.minimum, minimum))
+    for tighter in (lower, needs_more):
+        after = clamp(orders, tighter).currents
+        assert all(new <= old for new, old in zip(after, before, strict=True))
+
+
+@given(orders, limits)
+def test_one_phase_below_the_minimum_pauses_all(orders: Orders, limits: Limits) -> None:
+    """Unless each phase stands alone: that one can be left out is in no manual."""
+    one = clamp(orders, replace(limits, phases_alone=True))
+    all_of_them = clamp(orders, replace(limits, phases_alone=False))
+    assert all_of_them.currents == (
+        one.currents if all(one.currents) else (0.0, 0.0, 0.0)
+    )
+    assert all_of_them.fail_safe == one.fail_safe
+
+
+@given(orders, limits)
+def test_a_pause_has_a_reason_and_nothing_else_has(
+    orders: Orders, limits: Limits
+) -> None:
+    reason = pause_reason(orders, limits)
+    assert (reason is not None) == clamp(orders, limits).paused
+    assert (reason is PauseReason.NOT_ALLOWED) == (orders.allowed is False)
+    if reason is PauseReason.LIMIT_TOO_LOW:
+        high = replace(orders, limit=CurrentLimit(current=limits.installation))
+        assert pause_reason(high, limits) is None
+    if reason is PauseReason.MAXIMUM_TOO_LOW:
+        assert round_down(limits.ceiling, limits.step) < limits.minimum
+
+
+@pytest.mark.parametrize(
+    ("limit", "minimum", "step", "currents"),
+    [
+        (CurrentLimit(current=0.0), 6.0, 0.1, (0.0, 0.0, 0.0)),
+        (CurrentLimit(current=5.9), 6.0, 0.1, (0.0, 0.0, 0.0)),
+        # A household socket: 16 A or nothing.
+        (CurrentLimit(current=15.0), 16.0, 1.0, (0.0, 0.0, 0.0)),
+        (CurrentLimit(current=16.0), 16.0, 1.0, (16.0, 16.0, 16.0)),
+        # An EVBox whose modules need 14 A.
+        (CurrentLimit(current=13.9), 14.0, 0.1, (0.0, 0.0, 0.0)),
+        (
+            CurrentLimit(current=16.0, phases=(None, 3.0, None)),
+            6.0,
+            0.1,
+            (0.0, 0.0, 0.0),
+        ),
+        (
+            CurrentLimit(current=16.0, phases=(None, 6.0, 8.0)),
+            6.0,
+            0.1,
+            (16.0, 6.0, 8.0),
+        ),
+    ],
+)
+def test_a_limit_below_the_minimum_is_a_pause(
+    limit: CurrentLimit, minimum: float, step: float, currents: tuple[float, ...]
+) -> None:
+    limits = Limits(installation=32.0, minimum=minimum, step=step)
+    assert clamp(Orders(limit=limit), limits).currents == currents
+
+
 @given(orders, limits)
 def test_the_time_out_is_never_zero(orders: Orders, limits: Limits) -> None:
     assert 1 <= clamp(orders, limits).fail_safe_timeout <= MAXIMUM_TIMEOUT
@@ -174,15 +302,13 @@ def test_values_are_rounded_down_to_the_step(
     assert round_down(wish, step) == result
 
 
-@pytest.mark.parametrize("wish", [nan, inf, -inf, -6, 10_000, 5.9, 0.1, 32.1], ids=str)
+@pytest.mark.parametrize("wish", [nan, inf, -inf, -6, 10_000, 32.1], ids=str)
 def test_an_absurd_current_is_refused_with_a_reason(wish: float) -> None:
-    with pytest.raises(
-        RefusedOrderError, match=r"^current .*(finite|negative|above|below)"
-    ):
+    with pytest.raises(RefusedOrderError, match=r"^current .*(finite|negative|above)"):
         check_change(OrderChange(current=wish), Limits(installation=32.0))
 
 
-@pytest.mark.parametrize("wish", [0, 6, 6.9, 32])
+@pytest.mark.parametrize("wish", [0, 0.1, 5.9, 6, 6.9, 32])
 def test_a_usable_current_is_taken(wish: float) -> None:
     change = check_change(OrderChange(current=wish), Limits(installation=32.0))
     assert change.current == wish

@@ -39,12 +39,20 @@ from .model import (
     Limits,
     OrderChange,
     Orders,
+    PauseReason,
     Persistence,
     Range,
     Setting,
 )
 from .readings import ChargerInfo, ChargerReading
-from .safety import Setpoint, cautious, check_change, clamp, expired
+from .safety import (
+    Setpoint,
+    cautious,
+    check_change,
+    clamp,
+    expired,
+    pause_reason,
+)
 from .schedule import Kind, Slot
 from .statistics import ChargerStatistics
 
@@ -120,6 +128,7 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         self.bus: Scheduler | None = None
         self._renewed: float | None = None
         self._clamped: tuple[tuple[Orders, Limits], Setpoint] | None = None
+        self._reason: tuple[tuple[Orders, Limits], PauseReason | None] | None = None
 
     # -- What it is and has ------------------------------------------------------
 
@@ -161,6 +170,17 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         return False
 
     @property
+    def pause_reason(self) -> PauseReason | None:
+        """Return why no car is charged now; ``None``: its orders let one charge."""
+        told = self.reading.allowed if self.reading is not None else None
+        if told is False and not self.waits_for_current:
+            return PauseReason.NOT_ALLOWED
+        inputs = (self.effective_orders, self.limits)
+        if self._reason is None or self._reason[0] != inputs:
+            self._reason = (inputs, pause_reason(*inputs))
+        return self._reason[1]
+
+    @property
     def fail_safe(self) -> FailSafe | None:
         """Return what it does when no message comes; ``None``: not known yet."""
         return FailSafe.NOTHING
@@ -179,6 +199,7 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
             self.noticed,
             self.info,
             self.waits_for_current,
+            self.pause_reason,
         )
 
     @property

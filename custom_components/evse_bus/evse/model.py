@@ -100,6 +100,21 @@ class SessionResult(StrEnum):
     PILOT_UNSTABLE = "pilot_unstable"
 
 
+class PauseReason(StrEnum):
+    """Why no car is charged, as far as it is our doing or the user's."""
+
+    NOT_ALLOWED = "not_allowed"
+    """The user has switched charging off, here or at the charger."""
+    LIMIT_TOO_LOW = "limit_too_low"
+    """The limit is below the charger's minimum; a higher one lifts the pause."""
+    MAXIMUM_TOO_LOW = "maximum_too_low"
+    """Installation, charger or cable carry less than the charger's minimum."""
+    SUPPLY_TOO_LOW = "supply_too_low"
+    """Its part of the shared supply is below the minimum."""
+    LIMIT_NOT_FOLLOWED = "limit_not_followed"
+    """It was stopped because it offered more than its limit."""
+
+
 class Capability(StrEnum):
     """A feature of a charger; an entity exists only for a capability."""
 
@@ -246,7 +261,7 @@ class CurrentLimit:
     """
 
     current: float
-    """For all phases, A; 0 or at least the charger's minimum."""
+    """For all phases, A; below the charger's minimum: no charging."""
     phases: Phases[float | None] = UNKNOWN_PHASES
     """For one phase, A; ``None``: only ``current`` counts."""
 
@@ -355,6 +370,8 @@ class Limits:
     """Lowest current above 0 that this charger can offer, A."""
     step: float = 0.1
     """Resolution of currents in the protocol, A."""
+    phases_alone: bool = False
+    """A phase below the minimum pauses that phase only, not all of them."""
 
     @property
     def ceiling(self) -> float:

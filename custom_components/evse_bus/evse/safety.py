@@ -10,7 +10,14 @@ from math import isfinite
 from numbers import Real
 
 from .errors import RefusedOrderError
-from .model import CurrentLimit, Limits, OrderChange, Orders, Phases
+from .model import (
+    CurrentLimit,
+    Limits,
+    OrderChange,
+    Orders,
+    PauseReason,
+    Phases,
+)
 
 MAXIMUM_TIMEOUT = 0xFFFF
 """Longest fail-safe time-out that a protocol can encode, s (EVBox: one word)."""
@@ -73,23 +80,42 @@ def round_down(value: float, step: float) -> float:
 def clamp(orders: Orders, limits: Limits) -> Setpoint:
     """Return the set-point for these orders within these limits.
 
-    Raises RefusedOrderError when an order is not a finite number from 0.
+    A limit below the minimum is a pause, of all phases unless each stands alone: that
+    a charger can leave out a single phase is in no manual. A fail-safe current may be
+    anything (the manual of the EVBox has 4, 8 and 7 A). Raises RefusedOrderError when
+    an order is not a finite number from 0.
     """
-    if orders.allowed is False:
-        currents: Phases[float] = (0.0, 0.0, 0.0)
-        # The limit behind a pause is checked too: a bad one must not wait for the end.
-        _clamp_limit(orders.limit, limits)
-    else:
-        one, two, three = (
-            value if value >= limits.minimum else 0.0
-            for value in _clamp_limit(orders.limit, limits)
-        )
-        currents = (one, two, three)
+    # The limit behind a pause is checked too: a bad one must not wait for the end.
+    limit = _clamp_limit(orders.limit, limits)
     return Setpoint(
-        currents=currents,
+        currents=_chargeable(
+            (0.0, 0.0, 0.0) if orders.allowed is False else limit, limits
+        ),
         fail_safe=_clamp_limit(orders.fail_safe, limits),
         fail_safe_timeout=_clamp_timeout(orders.fail_safe_timeout),
     )
+
+
+def pause_reason(orders: Orders, limits: Limits) -> PauseReason | None:
+    """Return why these orders let no car charge; ``None``: at least one phase may.
+
+    Raises RefusedOrderError when a limit is not a finite number from 0.
+    """
+    if orders.allowed is False:
+        return PauseReason.NOT_ALLOWED
+    if any(_chargeable(_clamp_limit(orders.limit, limits), limits)):
+        return None
+    if round_down(limits.ceiling, limits.step) < limits.minimum:
+        return PauseReason.MAXIMUM_TOO_LOW
+    return PauseReason.LIMIT_TOO_LOW
+
+
+def _chargeable(currents: Phases[float], limits: Limits) -> Phases[float]:
+    """Return the currents with which a car may charge: 0 or at least the minimum."""
+    one, two, three = (value if value >= limits.minimum else 0.0 for value in currents)
+    if not limits.phases_alone and not (one and two and three):
+        return (0.0, 0.0, 0.0)
+    return one, two, three
 
 
 def _clamp_limit(limit: CurrentLimit, limits: Limits) -> Phases[float]:
@@ -112,14 +138,14 @@ def _clamp_timeout(value: int) -> int:
 def check_change(change: OrderChange, limits: Limits) -> OrderChange:
     """Return a change as it will be stored: finite and on the protocol's step.
 
-    A current is 0 or at least the minimum, and not above the installation limit;
-    a phase and a fail-safe current may be anything up to that (a phase: 0 or at
-    least the minimum). Raises RefusedOrderError for anything else.
+    A current may be anything from 0 to the installation limit. What charger and cable
+    can do counts in `clamp` only: an order outlasts both, and a request to lower the
+    current is never refused. Raises RefusedOrderError for anything else.
     """
     return OrderChange(
         allowed=change.allowed,
-        current=_check(change.current, limits, "current", above_minimum=True),
-        phases=_check_phases(change.phases, limits, "phase", above_minimum=True),
+        current=_check(change.current, limits, "current"),
+        phases=_check_phases(change.phases, limits, "phase"),
         fail_safe_current=_check(change.fail_safe_current, limits, "fail-safe"),
         fail_safe_phases=_check_phases(
             change.fail_safe_phases, limits, "fail-safe phase"
@@ -129,29 +155,18 @@ def check_change(change: OrderChange, limits: Limits) -> OrderChange:
 
 
 def _check_phases(
-    phases: Phases[float | None],
-    limits: Limits,
-    what: str,
-    *,
-    above_minimum: bool = False,
+    phases: Phases[float | None], limits: Limits, what: str
 ) -> Phases[float | None]:
-    one, two, three = (
-        _check(value, limits, what, above_minimum=above_minimum) for value in phases
-    )
+    one, two, three = (_check(value, limits, what) for value in phases)
     return one, two, three
 
 
-def _check(
-    value: float | None, limits: Limits, what: str, *, above_minimum: bool = False
-) -> float | None:
+def _check(value: float | None, limits: Limits, what: str) -> float | None:
     if value is None:
         return None
     checked = number(value, what)
     if checked > limits.installation:
         message = f"{what} {checked:g} A is above the {limits.installation:g} A limit"
-        raise RefusedOrderError(message)
-    if above_minimum and 0 < checked < limits.minimum:
-        message = f"{what} {checked:g} A is below the minimum {limits.minimum:g} A"
         raise RefusedOrderError(message)
     return round_down(checked, limits.step)
 

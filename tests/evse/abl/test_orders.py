@@ -15,7 +15,13 @@ from custom_components.evse_bus.evse.errors import (
     RefusedOrderError,
     ReplyTimeoutError,
 )
-from custom_components.evse_bus.evse.model import Fault, OrderChange, Orders, Status
+from custom_components.evse_bus.evse.model import (
+    Fault,
+    OrderChange,
+    Orders,
+    PauseReason,
+    Status,
+)
 from tests.virtual import AblBox, Car
 
 from .scene import LIMIT, Scene, config, orders, until
@@ -315,10 +321,61 @@ async def test_a_limit_of_0_a_pauses_and_another_limit_ends_it() -> None:
         assert scene.writes() == [PAUSE, 166, PAUSE]
 
 
+async def test_a_limit_below_the_minimum_is_kept_and_pauses() -> None:
+    box = AblBox(1, car=plugged())
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders(allowed=True))
+        await until(lambda: box.state == "C2")
+        await charger.change_orders(limit(5.9))
+        assert charger.orders.limit.current == 5.9
+        assert charger.orders.allowed is True
+        assert scene.writes() == [PAUSE]
+        assert charger.pause_reason is PauseReason.LIMIT_TOO_LOW
+        # Allowed once more, it still waits for a limit that is high enough.
+        await charger.change_orders(ON)
+        await charger.change_orders(limit(3))
+        assert set(scene.writes()) == {PAUSE}
+        await charger.change_orders(limit(6))
+        assert scene.writes()[-1] == 100
+        assert charger.pause_reason is None
+
+
+async def test_what_was_allowed_below_the_minimum_starts_with_a_higher_limit() -> None:
+    box = AblBox(1, car=plugged())
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders(allowed=True))
+        await charger.change_orders(OFF)
+        await charger.change_orders(limit(0))
+        assert charger.pause_reason is PauseReason.NOT_ALLOWED
+        await charger.change_orders(ON)
+        assert charger.pause_reason is PauseReason.LIMIT_TOO_LOW
+        assert set(scene.writes()) == {PAUSE}
+        await charger.change_orders(limit(10))
+        assert scene.writes()[-1] == 166
+
+
+async def test_a_limit_below_the_minimum_does_not_claim_the_pause_of_another() -> None:
+    """Paused elsewhere: neither the low limit nor the next one is a reason to start."""
+    box = AblBox(1, car=plugged())
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders(allowed=True))
+        await until(lambda: box.state == "C2")
+        box.set_by_other_master(0)
+        await scene.polled(charger)
+        for current in (3, 10, 0, 16):
+            await charger.change_orders(limit(current))
+        await scene.polled(charger)
+        assert box.ic_amps == 0
+        assert 166 not in scene.writes()
+        assert charger.pause_reason is PauseReason.NOT_ALLOWED
+        await charger.change_orders(ON)
+        assert scene.writes()[-1] == 266
+
+
 async def test_invalid_limits_are_refused() -> None:
     async with Scene(AblBox(1)) as scene:
         charger = await scene.settled(config(), orders(10))
-        for current in (float("nan"), float("inf"), -1, 10000, 5.9, 17):
+        for current in (float("nan"), float("inf"), -1, 10000, 17):
             with pytest.raises(RefusedOrderError):
                 await charger.change_orders(limit(current))
         assert scene.writes() == [166]

@@ -9,7 +9,6 @@ import pytest
 
 from custom_components.evse_bus.evse.errors import (
     NotAvailableError,
-    RefusedOrderError,
     ReplyTimeoutError,
     WrongChargerError,
 )
@@ -21,6 +20,7 @@ from custom_components.evse_bus.evse.model import (
     Fault,
     OrderChange,
     Orders,
+    PauseReason,
 )
 from custom_components.evse_bus.evse.schedule import Kind
 from tests.evse.simulated_line import until
@@ -170,16 +170,51 @@ def test_single_phases_and_the_fail_back() -> None:
             await charger.change_orders(
                 OrderChange(
                     current=20.0,
-                    phases=(None, 10.5, 0.0),
+                    phases=(None, 10.5, 7.0),
                     fail_safe_current=8.0,
                     fail_safe_phases=(0.0, None, 4.5),
                     fail_safe_timeout=90,
                 )
             )
             order = stage.line.orders[-1]
-            assert order.limits == (20.0, 10.5, 0.0)
+            assert order.limits == (20.0, 10.5, 7.0)
             assert order.fallback == (0.0, 8.0, 4.5)
             assert order.timeout == 90
+
+    simulate(scene())
+
+
+@pytest.mark.parametrize(
+    ("one_phase_modules", "paused", "limits"),
+    [
+        (False, 0.0, (0.0, 0.0, 0.0)),
+        (False, 5.9, (0.0, 0.0, 0.0)),
+        (True, 0.0, (20.0, 0.0, 20.0)),
+        (True, 5.9, (20.0, 0.0, 20.0)),
+    ],
+)
+def test_a_phase_below_the_minimum(
+    one_phase_modules: bool,  # noqa: FBT001 - a parameter of the test
+    paused: float,
+    limits: tuple[float, float, float],
+) -> None:
+    """It pauses all of them, unless the user has one-phase modules."""
+
+    async def scene() -> None:
+        async with Scene.of(box()) as stage:
+            charger = stage.add(one_phase_modules=one_phase_modules)
+            await asyncio.sleep(10.0)
+            await charger.change_orders(OrderChange(current=20.0))
+            await charger.change_orders(OrderChange(phases=(None, paused, None)))
+            assert stage.line.orders[-1].limits == limits
+            assert charger.orders.limit.phases == (None, paused, None)
+            stopped = not any(limits)
+            assert charger.pause_reason is (
+                PauseReason.LIMIT_TOO_LOW if stopped else None
+            )
+            await charger.change_orders(OrderChange(phases=(None, 6.0, None)))
+            assert stage.line.orders[-1].limits == (20.0, 6.0, 20.0)
+            assert charger.pause_reason is None
 
     simulate(scene())
 
@@ -192,9 +227,12 @@ def test_the_smallest_minimum_of_the_modules_counts() -> None:
             await asyncio.sleep(10.0)
             assert charger.limits.minimum == 8.0
             assert stage.line.orders[-1].limits == (0.0, 0.0, 0.0)
-            with pytest.raises(RefusedOrderError):
-                await charger.change_orders(OrderChange(current=7.0))
+            await charger.change_orders(OrderChange(current=7.9))
+            assert charger.orders.limit.current == 7.9
+            assert stage.line.orders[-1].limits == (0.0, 0.0, 0.0)
+            assert charger.pause_reason is PauseReason.LIMIT_TOO_LOW
             await charger.change_orders(OrderChange(current=8.0))
+            assert charger.pause_reason is None
             assert stage.line.orders[-1].limits == (8.0, 8.0, 8.0)
 
     simulate(scene())

@@ -6,7 +6,6 @@ import pytest
 
 from custom_components.evse_bus.evse.errors import (
     EvseError,
-    RefusedOrderError,
 )
 from custom_components.evse_bus.evse.ews import PROTOCOL
 from custom_components.evse_bus.evse.ews.config import EwsPortConfig
@@ -15,6 +14,7 @@ from custom_components.evse_bus.evse.model import (
     Capability,
     Fault,
     OrderChange,
+    PauseReason,
     Status,
 )
 
@@ -73,9 +73,12 @@ def test_one_rc_tells_of_both_ports() -> None:
 def test_a_household_socket_gives_16_amperes_or_none() -> None:
     async def acts(scene: EwsScene) -> None:
         assert Capability.OFFERED_CURRENT not in scene.charger().capabilities
-        with pytest.raises(RefusedOrderError):
-            await scene.charger().change_orders(amperes(10.0))
         await scene.charge()
+        await scene.charger().change_orders(amperes(15.0))
+        assert scene.status() == 0x50
+        assert scene.charger().pause_reason is PauseReason.LIMIT_TOO_LOW
+        await scene.charger().change_orders(amperes(16.0))
+        assert scene.status() in (0x40, 0x41)
         assert not scene.line.limits(1)
         assert scene.line.limits(2)
         await scene.charger().change_orders(amperes(0.0))

@@ -9,6 +9,7 @@ from custom_components.evse_bus.evse.model import (
     Circuit,
     Fault,
     OrderChange,
+    PauseReason,
     Setting,
     Status,
 )
@@ -197,6 +198,34 @@ def test_a_box_closed_at_the_box_stays_closed() -> None:
     simulate(scene())
 
 
+def test_a_limit_below_the_minimum_is_kept_and_pauses() -> None:
+    async def scene() -> None:
+        async with MasterScene(units=(2,)) as scene:
+            await asyncio.sleep(5)
+            await scene.charge(2)
+            await asyncio.sleep(3)
+            slave = scene.slave(2)
+            await slave.change_orders(OrderChange(current=5.9))
+            assert slave.orders.limit.current == 5.9
+            assert scene.offers == 0
+            assert slave.pause_reason is PauseReason.LIMIT_TOO_LOW
+            await asyncio.sleep(100)
+            assert scene.offers == 0
+            # The user's own pause, and permission again: only the limit is missing.
+            await slave.change_orders(OrderChange(allowed=False))
+            assert slave.pause_reason is PauseReason.NOT_ALLOWED
+            await slave.change_orders(OrderChange(allowed=True))
+            await asyncio.sleep(100)
+            assert scene.offers == 0
+            assert slave.pause_reason is PauseReason.LIMIT_TOO_LOW
+            await slave.change_orders(OrderChange(current=9.0))
+            await asyncio.sleep(5)
+            assert scene.offers == 9
+            assert slave.pause_reason is None
+
+    simulate(scene())
+
+
 def test_a_pause_by_a_limit_of_0_a_ends_with_that_limit() -> None:
     async def scene() -> None:
         async with MasterScene(units=(2,)) as scene:
@@ -243,6 +272,7 @@ def test_the_last_to_begin_is_stopped_when_the_circuit_limit_falls() -> None:
             # It is not out of service: it waits for current.
             waiting = scene.slave(4)
             assert waiting.waits_for_current
+            assert waiting.pause_reason is PauseReason.SUPPLY_TOO_LOW
             assert waiting.reading is not None
             assert waiting.reading.connectors[1].status is Status.SUSPENDED_EVSE
             # There is room at once, but it does not start and stop all the time.

@@ -7,7 +7,6 @@ import pytest
 from custom_components.evse_bus.evse.errors import (
     EvseError,
     NotConfirmedError,
-    RefusedOrderError,
     SharedAddressError,
     SupersededError,
 )
@@ -16,6 +15,7 @@ from custom_components.evse_bus.evse.model import (
     Fault,
     Mode,
     OrderChange,
+    PauseReason,
     Status,
 )
 from custom_components.evse_bus.evse.smartevse import POLLED
@@ -409,10 +409,44 @@ def test_an_order_that_is_not_renewed(dialect: Dialect) -> None:
 def test_a_limit_below_its_own_minimum_is_refused(dialect: Dialect) -> None:
     async def acts(scene: PolledScene) -> None:
         assert scene.charger.limits.minimum == 8
-        with pytest.raises(RefusedOrderError):
-            await scene.charger.change_orders(OrderChange(current=7))
+        await scene.charge()
+        assert scene.charger.pause_reason is None
+        await scene.charger.change_orders(OrderChange(current=7))
+        assert not scene.outlet.access
+        assert scene.charger.orders.limit.current == 7
+        assert scene.charger.pause_reason is PauseReason.LIMIT_TOO_LOW
+        assert scene.charger.orders.allowed is not False
+        await scene.charger.change_orders(OrderChange(current=8))
+        assert scene.outlet.access
+        await scene.until(lambda: scene.charger.pause_reason is None)
 
     play(PolledScene(dialect, minimum=8), acts)
+
+
+@each
+def test_what_was_allowed_below_the_minimum_starts_with_a_higher_limit(
+    dialect: Dialect,
+) -> None:
+    """Permission stands, whatever came first: only the limit was missing."""
+
+    async def acts(scene: PolledScene) -> None:
+        await scene.charge()
+        await scene.charger.change_orders(OrderChange(allowed=False))
+        await scene.charger.change_orders(OrderChange(current=0))
+        assert scene.charger.pause_reason is PauseReason.NOT_ALLOWED
+        await scene.charger.change_orders(OrderChange(allowed=True))
+        assert not scene.outlet.access
+        assert scene.charger.pause_reason is PauseReason.LIMIT_TOO_LOW
+        await scene.charger.change_orders(OrderChange(current=9))
+        assert scene.outlet.access
+        await scene.until(lambda: scene.box.offers == 9, 90)
+        # The user's own pause is no limit's to lift.
+        await scene.charger.change_orders(OrderChange(current=3))
+        await scene.charger.change_orders(OrderChange(allowed=False))
+        await scene.charger.change_orders(OrderChange(current=9))
+        assert not scene.outlet.access
+
+    play(PolledScene(dialect), acts)
 
 
 @older

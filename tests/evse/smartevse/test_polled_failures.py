@@ -9,7 +9,12 @@ import pytest
 
 from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.errors import EvseError, NotConfirmedError
-from custom_components.evse_bus.evse.model import Fault, OrderChange, Setting
+from custom_components.evse_bus.evse.model import (
+    Fault,
+    OrderChange,
+    PauseReason,
+    Setting,
+)
 from custom_components.evse_bus.evse.smartevse import POLLED
 from custom_components.evse_bus.evse.smartevse.dialects import MAPS, Dialect
 from custom_components.evse_bus.evse.smartevse.registers import read_request
@@ -129,6 +134,7 @@ def test_a_firmware_without_the_override_is_stopped() -> None:
         await scene.polled(2)
         assert Fault.LIMIT_NOT_TAKEN in scene.charger.faults
         assert scene.charger.waits_for_current
+        assert scene.charger.pause_reason is PauseReason.LIMIT_NOT_FOLLOWED
         # A limit that it would exceed again starts nothing.
         await scene.charger.change_orders(OrderChange(current=9))
         await scene.polled(3)

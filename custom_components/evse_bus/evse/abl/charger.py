@@ -98,6 +98,11 @@ class AblCharger(AblReader):
     def limits(self) -> Limits:
         return Limits(installation=self.config.installation_limit)
 
+    @property
+    @override
+    def waits_for_current(self) -> bool:
+        return self._paused_by_limit
+
     @override
     def on_line_open(self) -> None:
         super().on_line_open()
@@ -202,9 +207,9 @@ class AblCharger(AblReader):
             phase is not None for phase in change.phases
         )
         if status.duty == PAUSE:
-            # A limit ends only the pause of our own limit of 0 A.
-            by_limit = self._paused_by_limit or self.setpoint.paused
-            return changes_limit and by_limit and orders.allowed is not False
+            # A limit ends only the pause that our own limit has brought about.
+            by_limit = changes_limit and self._paused_by_limit
+            return by_limit and orders.allowed is not False
         if status.state == E0:
             return lowers
         return lowers or changes_limit or self._fell_back

@@ -4,7 +4,7 @@ import re
 from typing import Final
 
 from ..address import NumberAddress
-from ..options import Choice, HexBytes
+from ..options import Choice, HexBytes, Toggle
 from ..protocol import Make, Protocol
 from ..redaction import SerialNumbers
 from .charger import EvboxCharger
@@ -52,7 +52,7 @@ PROTOCOL: Final = Protocol(
         any=ANY_SERIAL,
         is_serial=True,
     ),
-    options=(_COMMAND, _INFORMATION),
+    options=(_COMMAND, _INFORMATION, Toggle(name="one_phase_modules")),
     serials=_SERIALS,
     private=frozenset({"information"}),
 )

@@ -164,6 +164,7 @@ class EvboxCharger(Charger[EvboxConfig]):
             reports_maximum=True,
             reported=None if maximum.reported is None else maximum.value,
             minimum=self._plausibility.minimum.value,
+            phases_alone=self.config.one_phase_modules,
         )
 
     @property

@@ -1,7 +1,7 @@
 """Configuration of a ChargePoint, and the numbers of its line."""
 
 from dataclasses import dataclass
-from typing import Final
+from typing import ClassVar, Final
 
 from ..framing import LineSettings, Timing
 from ..model import ChargerConfig
@@ -57,6 +57,11 @@ class EvboxConfig(ChargerConfig):
     information: bytes = bytes(INFORMATION_LENGTH)
     """Information module (68), passed on by the box: byte 1 vendor code, bytes 8-9
     maximum current of the connection in A, the rest free."""
+    one_phase_modules: bool = False
+    """Each module charges on one phase: a phase below the minimum pauses that phase
+    only. The manual defines no 0 on a single phase."""
+
+    live: ClassVar = ChargerConfig.live | {"one_phase_modules"}
 
     def __post_init__(self) -> None:
         """Check the values that go to the wire."""

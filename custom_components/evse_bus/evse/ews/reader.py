@@ -41,7 +41,7 @@ class EwsReader(BoxPort):
         self._implausible = 0
         self._restarts = 0
 
-    # -- Properties --------------------------------------------------------------------
+    # -- What it is and has ------------------------------------------------------
 
     @property
     @override

@@ -33,6 +33,7 @@ from ..model import (
     Fault,
     OrderChange,
     Orders,
+    PauseReason,
     Persistence,
     Range,
     Setting,
@@ -128,6 +129,14 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
     @override
     def waits_for_current(self) -> bool:
         return self._paused_for_limit
+
+    @property
+    @override
+    def pause_reason(self) -> PauseReason | None:
+        not_followed = None
+        if self._excess is not None:
+            not_followed = PauseReason.LIMIT_NOT_FOLLOWED
+        return super().pause_reason or not_followed
 
     @property
     @override
@@ -401,6 +410,9 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
                 if self._must_pause(change):
                     ours = orders.allowed is not False
                     await self._stop(turn, ours=ours)
+                if change.allowed is True and orders.allowed is not False:
+                    # The user has allowed it, and a higher limit will do the rest.
+                    self._paused_for_limit = True
                 return
             await self._enable(turn, change)
 

@@ -30,6 +30,7 @@ from ..model import (
     Limits,
     OrderChange,
     Orders,
+    PauseReason,
     Persistence,
     Range,
     Setting,
@@ -182,6 +183,12 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
     @override
     def waits_for_current(self) -> bool:
         return self._paused_by_us
+
+    @property
+    @override
+    def pause_reason(self) -> PauseReason | None:
+        withheld = PauseReason.SUPPLY_TOO_LOW if self.withheld else None
+        return super().pause_reason or withheld
 
     # -- Its share -----------------------------------------------------------------
 
@@ -379,6 +386,9 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
                     self._withheld_at = None
                 if self.wanted.paused:
                     await self._switch_access(turn, allowed=False)
+                    if change.allowed is True and self._standing.allowed is not False:
+                        # The user has allowed it; a higher limit will do the rest.
+                        self._paused_by_us = True
                     return
                 starts = change.allowed is True or self._paused_by_us
                 if starts and not self.withheld:

@@ -65,7 +65,7 @@ class UnknownBox:
 
 @dataclass(slots=True)
 class ListenerStatistics:
-    """Numbers of connections, by their outcome."""
+    """Numbers of connections, by what became of them."""
 
     accepted: int = 0
     not_allowed: int = 0
