@@ -291,8 +291,8 @@ async def test_second_port_goes_and_comes_back(hass: HomeAssistant) -> None:
             await change(hass, entry, changed("Yard", 16, 13))
             back = await get_entity(hass, "number", entry, f"2_{key}")
             assert port_device(hass, entry, 2) is not None
-            # It begins as every port does: with the fail-safe current.
-            assert state_of(hass, back) == "6.0"
+            # Its orders are those of the box's serial number, so they are kept.
+            assert state_of(hass, back) == "9.0"
             assert hass.states.get(back).attributes["max"] == 13
             assert state_of(hass, numbers[0]) == "11.0"
             assert (

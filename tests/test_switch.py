@@ -77,7 +77,7 @@ async def test_the_outlet_of_an_abl_box(hass: HomeAssistant) -> None:
         await call(hass, "switch.turn_off", outlet)
         assert box.state == "E0"
         await wait_for_state(hass, outlet, "off")
-        await wait_for_state(hass, status, "unavailable")
+        await wait_for_state(hass, status, "out_of_service")
         allowed = await get_entity(hass, "switch", entry, "charging_allowed")
         with pytest.raises(HomeAssistantError) as refused:
             await call(hass, "switch.turn_on", allowed)
