@@ -11,7 +11,8 @@ import pytest
 
 from custom_components.evse_bus.diagnostics import async_get_config_entry_diagnostics
 from custom_components.evse_bus.discovery import MOST_OFFERS
-from custom_components.evse_bus.evse.ews import UnknownBox
+from custom_components.evse_bus.evse.dialling import UnknownBox
+from custom_components.evse_bus.evse.readings import ChargerInfo
 from tests.common import bus_entry, get_entity, wait_for_state, wait_until
 from tests.flow import Flow, box as typed_box, fields, ignore, offers
 from tests.listening import (
@@ -171,7 +172,9 @@ async def test_many_serial_numbers_are_not_that_many_offers(
         hass.set_state(CoreState.starting)
     async with listening(hass) as entry:
         for number in range(MOST_OFFERS + 4):
-            stranger = UnknownBox(serial=f"{number:012d}", firmware="X", peer=None)
+            serial = f"{number:012d}"
+            info = ChargerInfo(manufacturer="P-CHARGE", model="EWS-Box", firmware="X")
+            stranger = UnknownBox(serial=serial, info=info, peer=None)
             listener_of(entry).on_unknown_box(stranger)
         if starting:
             # Home Assistant would keep an offer for each until it has started.

@@ -7,7 +7,7 @@ and so a bus and a scheduler, of its own: a slow or dead box delays no other.
 from abc import ABC, abstractmethod
 import asyncio
 from collections.abc import Callable, Iterable, Mapping
-from ipaddress import IPv4Network, IPv6Network, ip_network
+from ipaddress import ip_network
 from typing import Any, override
 
 from homeassistant.config_entries import ConfigEntry
@@ -16,7 +16,7 @@ from homeassistant.const import CONF_DEVICE, CONF_HOST, CONF_PORT
 from .configuration import line_settings, protocol_of, supply_of
 from .const import CONF_ALLOWED
 from .evse.bus import Bus
-from .evse.ews import Listener, UnknownBox
+from .evse.dialling import Network, UnknownBox
 from .evse.master import BusMaster
 from .evse.model import ChargerConfig
 
@@ -108,7 +108,7 @@ class ListenerConnections(Connections):
         ``on_unknown_box`` is called with each box that dials and is not configured.
         """
         self.name = connection_name(entry.data)
-        self.listener = Listener(
+        self.listener = protocol_of(entry.data).listen_at(
             entry.data[CONF_HOST],
             entry.data[CONF_PORT],
             allowed=allowed_networks(entry.options),
@@ -175,7 +175,7 @@ def make_connections(
     return PortConnection(entry)
 
 
-def allowed_networks(options: Mapping[str, Any]) -> list[IPv4Network | IPv6Network]:
+def allowed_networks(options: Mapping[str, Any]) -> list[Network]:
     """Return the networks whose boxes may dial in; empty: all."""
     stored: Iterable[str] = options.get(CONF_ALLOWED, ())
     return [ip_network(one) for one in stored]

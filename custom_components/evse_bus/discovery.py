@@ -15,7 +15,7 @@ from homeassistant.helpers.dispatcher import async_dispatcher_connect
 from homeassistant.helpers.start import async_at_started
 
 from .configuration import protocol_of
-from .const import CONF_PROTOCOL, CONF_SERIAL, DOMAIN
+from .const import CONF_PROTOCOL, DOMAIN
 
 if TYPE_CHECKING:
     from homeassistant.config_entries import (
@@ -25,11 +25,10 @@ if TYPE_CHECKING:
     )
     from homeassistant.core import HomeAssistant
 
-    from .evse.ews import Listener, UnknownBox
+    from .evse.dialling import Listener, UnknownBox
 
 CONF_ENTRY: Final = "entry_id"
-CONF_FIRMWARE: Final = "firmware"
-CONF_PEER: Final = "peer"
+CONF_BOX: Final = "box"
 
 MOST_OFFERS: Final = 16
 """Discovery flows at once: a client may send any number of serial numbers."""
@@ -59,9 +58,7 @@ def async_wants_to_connect(
         data={
             CONF_ENTRY: entry.entry_id,
             CONF_PROTOCOL: protocol.key,
-            CONF_SERIAL: found.serial,
-            CONF_FIRMWARE: found.firmware,
-            CONF_PEER: str(found.peer or ""),
+            CONF_BOX: found,
         },
         # Home Assistant signals by this key when the box is no longer ignored.
         discovery_key=DiscoveryKey(domain=DOMAIN, key=unique_id, version=1),

@@ -24,7 +24,7 @@ from homeassistant.util import dt as dt_util
 
 from .evse.bus import Bus
 from .evse.charger import Charger
-from .evse.ews import Listener
+from .evse.dialling import Listener
 from .evse.model import (
     Capability,
     FailSafe,

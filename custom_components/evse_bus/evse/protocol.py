@@ -5,13 +5,14 @@ interface asks for its chargers: names, addresses, options. A protocol's folder 
 such description for each way in which its chargers are used.
 """
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
 from .address import AddressForm
 from .bus import Bus
 from .charger import Charger
+from .dialling import Listener, ListenerFactory, Network, UnknownBoxCallback
 from .framing import Frame, Framer, LineSettings, Timing
 from .line import Line
 from .master import BusMaster, ChargerGroup
@@ -84,8 +85,8 @@ class Protocol[C: ChargerConfig = Any]:
     ports: int = 1
     """Most ports of one box, each a charger of its own (`ChargerConfig.address` is its
     number); 1: a box is one charger."""
-    dials_in: bool = False
-    """The boxes dial us: there is a listener and no port, and a bus for each box."""
+    listener: ListenerFactory | None = None
+    """Makes a listener, where boxes dial: that has a bus for each, and no port."""
     master: Callable[[Circuit], BusMaster] | None = None
     """Makes the master of the bus, where Home Assistant is that."""
     group: Callable[[], ChargerGroup] | None = None
@@ -116,6 +117,11 @@ class Protocol[C: ChargerConfig = Any]:
     """Fields of configurations, readings and infos that identify a person or house,
     beside serial numbers."""
 
+    @property
+    def dials_in(self) -> bool:
+        """Return whether boxes dial: there is a listener and no port."""
+        return self.listener is not None
+
     def unique_id(self, serial: str | None, address: int | str | None = None) -> str:
         """Return a unique id of a charger: by its serial number, else its address."""
         if serial is None:
@@ -145,3 +151,20 @@ class Protocol[C: ChargerConfig = Any]:
         elif self.group is not None:
             group = self.group()
         return Bus(line, self.framer(), self.timing, name, group=group)
+
+    def listen_at(
+        self,
+        host: str,
+        port: int,
+        *,
+        allowed: Iterable[Network] = (),
+        on_unknown_box: UnknownBoxCallback = lambda _box: None,
+    ) -> Listener:
+        """Return a listener of this protocol; `Listener.start` opens it.
+
+        Raises TypeError for a protocol whose boxes do not dial.
+        """
+        if self.listener is None:
+            message = f"{self.name}: boxes are on a port, they do not dial"
+            raise TypeError(message)
+        return self.listener(host, port, allowed=allowed, on_unknown_box=on_unknown_box)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import replace
 from ipaddress import ip_address, ip_network
 import re
 import socket
@@ -38,13 +39,12 @@ from ..connections import address_name
 from ..const import (
     CONF_ALLOWED,
     CONF_PROTOCOL,
-    CONF_SERIAL,
     DOMAIN,
     LOGGER,
     SUBENTRY_CHARGER,
 )
 from ..coordinator import EvseBusConfigEntry
-from ..discovery import CONF_ENTRY, CONF_FIRMWARE, CONF_PEER, is_set_up
+from ..discovery import CONF_BOX, CONF_ENTRY, is_set_up
 from ..evse.errors import (
     EvseError,
     LineError,
@@ -52,9 +52,7 @@ from ..evse.errors import (
     PortMissingError,
     PortPermissionError,
 )
-from ..evse.ews import Listener
 from ..evse.protocols import PROTOCOLS
-from ..evse.readings import ChargerInfo
 from ..evse.scan import FoundCharger
 from .address import Errors
 from .charger import Candidate
@@ -63,6 +61,7 @@ from .steps import ChargerSteps
 if TYPE_CHECKING:
     from homeassistant.core import HomeAssistant
 
+    from ..evse.dialling import UnknownBox
     from ..evse.protocol import Protocol
 
 FIRST_PORT: Final = 4712
@@ -119,9 +118,9 @@ def listen_data(typed: Mapping[str, Any]) -> tuple[dict[str, Any], Errors]:
     return {CONF_HOST: host, CONF_PORT: int(port)}, {}
 
 
-async def async_try_listen(data: Mapping[str, Any]) -> Errors:
+async def async_try_listen(protocol: Protocol, data: Mapping[str, Any]) -> Errors:
     """Listen for a moment; return the errors."""
-    listener = Listener(data[CONF_HOST], data[CONF_PORT])
+    listener = protocol.listen_at(data[CONF_HOST], data[CONF_PORT])
     try:
         await listener.start()
     except LineError as error:
@@ -260,8 +259,8 @@ class ListenerSteps(ChargerSteps[ConfigFlowContext, ConfigFlowResult, str], Conf
                 return {}
             if any(ip_address(host).is_unspecified for host in hosts):
                 # This entry has the port open: check the address only.
-                return await async_try_listen({**where, CONF_PORT: 0})
-        return await async_try_listen(where)
+                return await async_try_listen(self.protocol, {**where, CONF_PORT: 0})
+        return await async_try_listen(self.protocol, where)
 
     # -- A box that has dialled ----------------------------------------------------
 
@@ -270,9 +269,9 @@ class ListenerSteps(ChargerSteps[ConfigFlowContext, ConfigFlowResult, str], Conf
         self, discovery_info: dict[str, Any]
     ) -> ConfigFlowResult:
         """Offer a box that has dialled and is not set up."""
-        serial = discovery_info[CONF_SERIAL]
+        box: UnknownBox = discovery_info[CONF_BOX]
         self.protocol = PROTOCOLS[discovery_info[CONF_PROTOCOL]]
-        unique_id = self.protocol.unique_id(serial)
+        unique_id = self.protocol.unique_id(box.serial)
         await self.async_set_unique_id(unique_id)
         # An ignored box is such an entry, too.
         self._abort_if_unique_id_configured()
@@ -284,10 +283,10 @@ class ListenerSteps(ChargerSteps[ConfigFlowContext, ConfigFlowResult, str], Conf
         self._listener = entry
         self.bus_data = dict(entry.data)
         self.context["title_placeholders"] = {
-            "name": f"{self.protocol.make.name} {serial}"
+            "name": f"{self.protocol.make.name} {box.serial}"
         }
-        self._discovered = found_box(serial, discovery_info[CONF_FIRMWARE])
-        self._peer = discovery_info[CONF_PEER]
+        self._discovered = found_box(box)
+        self._peer = "?" if box.peer is None else str(box.peer)
         return await self.async_step_discovered()
 
     async def async_step_discovered(
@@ -304,7 +303,7 @@ class ListenerSteps(ChargerSteps[ConfigFlowContext, ConfigFlowResult, str], Conf
                 "serial": box.serial or "?",
                 "firmware": box.info.firmware or "?",
                 "listener": self._listener.title if self._listener else "?",
-                "peer": self._peer or "?",
+                "peer": self._peer,
             },
         )
 
@@ -340,16 +339,12 @@ class ListenerSteps(ChargerSteps[ConfigFlowContext, ConfigFlowResult, str], Conf
         )
 
 
-def found_box(serial: str, firmware: str | None) -> FoundCharger:
+def found_box(box: UnknownBox) -> FoundCharger:
     """Return an unknown box as a search result; it has reported only its identity."""
-    info = ChargerInfo(
-        manufacturer="P-CHARGE",
-        model="EWS-Box",
-        serial=serial,
-        # Any device can dial and send this text, which must not become a link.
-        firmware=re.sub(r"[^\w.-]", "", firmware or "") or None,
-    )
-    return FoundCharger(address=serial, serial=serial, info=info)
+    # Any device can dial and send this text, which must not become a link.
+    firmware = re.sub(r"[^\w.-]", "", box.info.firmware or "") or None
+    info = replace(box.info, firmware=firmware)
+    return FoundCharger(address=box.serial, serial=box.serial, info=info)
 
 
 def listener_title(protocol: Protocol, data: Mapping[str, Any]) -> str:

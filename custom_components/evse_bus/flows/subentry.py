@@ -101,9 +101,7 @@ class ChargerSubentryFlow(
         if not isinstance(connections, ListenerConnections):
             return []
         unknown = connections.listener.unknown_boxes
-        self._result = ScanResult(
-            found=tuple(found_box(one.serial, one.firmware) for one in unknown)
-        )
+        self._result = ScanResult(found=tuple(map(found_box, unknown)))
         return [one.serial for one in unknown]
 
     @override

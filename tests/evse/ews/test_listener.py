@@ -4,6 +4,7 @@ import asyncio
 
 import pytest
 
+from custom_components.evse_bus.evse.dialling import UnknownBox
 from custom_components.evse_bus.evse.errors import (
     NotAvailableError,
     PortBusyError,
@@ -12,7 +13,7 @@ from custom_components.evse_bus.evse.errors import (
 from custom_components.evse_bus.evse.ews.charger import EwsPort
 from custom_components.evse_bus.evse.ews.config import EwsPortConfig
 from custom_components.evse_bus.evse.ews.network import line, listener as listening
-from custom_components.evse_bus.evse.ews.network.listener import Listener, UnknownBox
+from custom_components.evse_bus.evse.ews.network.listener import Listener
 from custom_components.evse_bus.evse.model import CurrentLimit, OrderChange, Orders
 from tests.virtual import Car
 from tests.virtual.ews_box import EwsBox as VirtualBox

@@ -98,7 +98,7 @@ def test_who_is_there() -> None:
                 await until(lambda: has_reading(bus) and made.unknown_boxes)
                 (found,) = made.unknown_boxes
                 assert (found.serial, found.peer) == (OTHER, ip_address(HOST))
-                assert found.firmware == "M165300103"
+                assert found.info.firmware == "M165300103"
                 other.hang_up(redial=False)
                 await until(lambda: not made.unknown_boxes)
                 await made.unregister(SERIAL)

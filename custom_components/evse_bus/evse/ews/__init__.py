@@ -8,7 +8,7 @@ from ..protocol import Make, Protocol
 from ..redaction import SerialNumbers
 from .charger import EwsPort
 from .config import EwsPortConfig
-from .network.listener import Listener, UnknownBox
+from .network.listener import Listener
 from .port import BoxPorts
 from .scan import scan
 from .timing import SETTINGS, TCP_TIMING, TIMING
@@ -46,7 +46,7 @@ NETWORK: Final = replace(
     choice="ews_network",
     address=_SERIAL,
     timing=TCP_TIMING,
-    dials_in=True,
+    listener=Listener,
 )
 """Over the network: boxes dial a `Listener`, which has a bus for each."""
 
@@ -56,5 +56,4 @@ __all__ = [
     "EwsPort",
     "EwsPortConfig",
     "Listener",
-    "UnknownBox",
 ]

@@ -7,17 +7,24 @@ number. So a connection that answers keeps its number, and addresses can be rest
 """
 
 import asyncio
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 import errno
 from functools import partial
-from ipaddress import IPv4Network, IPv6Network
+from ipaddress import IPv4Network
 import logging
 from math import inf
 from typing import Final
 
 from ...bus import Bus
+from ...dialling import (
+    Address,
+    ListenerStatistics,
+    Network,
+    UnknownBox,
+    UnknownBoxCallback,
+)
 from ...errors import EvseError, LineError, PortBusyError, PortMissingError
 from ...exchange import Turn, Wire
 from ...framing import Frame
@@ -26,13 +33,12 @@ from ...statistics import ChargerStatistics
 from ...throttle import LOSSES, LOSSES_WINDOW, RateLimiter
 from ..box import EwsBox
 from ..port import BoxPorts
+from ..readings import charger_info
 from ..timing import TCP_TIMING
 from ..wire.frames import EwsFrame, EwsFramer, MessageId
-from .line import AcceptedLine, Address, Connection
+from .line import AcceptedLine, Connection
 
 _LOGGER = logging.getLogger(__name__)
-
-type Network = IPv4Network | IPv6Network
 
 IDENTIFY_TIME: Final = 10.0
 """Longest time for a connection to be identified, s."""
@@ -54,34 +60,6 @@ _MAPPED: Final = 96
 """Length of the prefix of an IPv4 address in the form of an IPv6 one, bits."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class UnknownBox:
-    """A box that has dialled and is not registered."""
-
-    serial: str
-    firmware: str
-    peer: Address | None
-
-
-@dataclass(slots=True)
-class ListenerStatistics:
-    """Numbers of connections, by what became of them."""
-
-    accepted: int = 0
-    not_allowed: int = 0
-    """From an address that may not connect."""
-    crowded_out: int = 0
-    """Dropped: too many unidentified connections."""
-    unidentified: int = 0
-    """Dropped: not identified, or not in time."""
-    unknown: int = 0
-    """Of boxes that are not registered."""
-    duplicates: int = 0
-    """Dropped: gave the number of a box that is connected and answers."""
-    replaced: int = 0
-    """Took the place of a connection that no longer answered."""
-
-
 @dataclass(slots=True, eq=False)
 class _RegisteredBox:
     """A box with a bus of its own."""
@@ -100,7 +78,7 @@ class Listener:
         port: int,
         *,
         allowed: Iterable[Network] = (),
-        on_unknown_box: Callable[[UnknownBox], None] = lambda _box: None,
+        on_unknown_box: UnknownBoxCallback = lambda _box: None,
     ) -> None:
         """Take the address; port 0: any free one (see `port`).
 
@@ -374,7 +352,7 @@ async def _read_identity(connection: Connection) -> UnknownBox:
     line.release()
     connection.keep(b"".join(infos))
     return UnknownBox(
-        serial=status.serial, firmware=status.firmware, peer=connection.peer
+        serial=status.serial, info=charger_info(status), peer=connection.peer
     )
 
 
