@@ -16,6 +16,7 @@ from custom_components.evse_bus import (
     sensor_tables,
     switch,
 )
+from custom_components.evse_bus.actions.table import ACTIONS
 from custom_components.evse_bus.evse.ews.box import Installation
 from custom_components.evse_bus.evse.ews.network.listener import (
     IDENTIFY_TIME,
@@ -30,7 +31,6 @@ from custom_components.evse_bus.evse.ews.wire.parameters import SystemMode
 from custom_components.evse_bus.evse.protocols import PROTOCOLS
 from custom_components.evse_bus.flows.listener import FIRST_PORT
 from custom_components.evse_bus.flows.schema import default_of
-from custom_components.evse_bus.services import ACTIONS
 from tests.virtual import AblBox, Car, EwsBox, EwsDialler, VirtualBus
 
 ROOT = Path(__file__).parents[1]

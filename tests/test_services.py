@@ -14,11 +14,11 @@ import probatio as vol
 import pytest
 from pytest_homeassistant_custom_component.common import MockConfigEntry, MockUser
 
+from custom_components.evse_bus.actions.table import ACTIONS
 from custom_components.evse_bus.const import DOMAIN
 from custom_components.evse_bus.errors import translated_errors
 from custom_components.evse_bus.evse.ews.wire.answers import EwsRefusedError, Refusal
 from custom_components.evse_bus.evse.ews.wire.frames import CommandId
-from custom_components.evse_bus.services import ACTIONS
 from tests.common import running, subentry_id, wait_until
 from tests.virtual import AblBox
 from tests.virtual.ews_box import EwsBox

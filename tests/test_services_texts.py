@@ -20,13 +20,13 @@ from custom_components.evse_bus.actions.parameters import (
     READABLE,
     TIME_ZONES,
 )
+from custom_components.evse_bus.actions.table import ACTIONS
 from custom_components.evse_bus.const import DOMAIN
 from custom_components.evse_bus.errors import ActionError
 from custom_components.evse_bus.evse.errors import RefusedOrderError
 from custom_components.evse_bus.evse.ews.wire.answers import Refusal
 from custom_components.evse_bus.evse.ews.wire.cards import ENTRIES, LARGEST
 from custom_components.evse_bus.evse.ews.wire.commands import PortLeds, set_leds
-from custom_components.evse_bus.services import ACTIONS
 from tests.flow import english, has_range
 
 from .services import WRITERS

@@ -27,6 +27,13 @@ PURE = (
 )
 """Files of a protocol folder that know no line and no conversation, beside `wire/`."""
 
+KNOW_A_PROTOCOL = {
+    # The cards, LEDs and parameter blocks of an EWS-Box: behaviour, which no protocol
+    # could declare as data.
+    "actions",
+}
+"""Parts of Home Assistant's side that import the folder of a protocol."""
+
 LIBRARY_MAY = {"pymodbus", "serialx"}
 """Third-party packages the library may import, all told in the README."""
 
@@ -158,6 +165,22 @@ def test_only_the_registry_knows_the_protocols() -> None:
         used = {name.split(".")[0] for name in local(path, EVSE)}
         if path.name != "protocols.py":
             assert not used & set(PROTOCOLS), path
+
+
+def test_home_assistants_side_knows_a_protocol_by_its_description() -> None:
+    """No import of a protocol's folder, and no key of a protocol as a text."""
+    words = set(PROTOCOLS) | {"ews_network", "smartevse_master"}
+    knowing = set()
+    for path in INTEGRATION.rglob("*.py"):
+        if path.is_relative_to(EVSE):
+            continue
+        used = {tuple(name.split(".")[:2]) for name in local(path, INTEGRATION)}
+        if used & {("evse", protocol) for protocol in PROTOCOLS}:
+            knowing.add(path.relative_to(INTEGRATION).parts[0])
+        nodes = ast.walk(ast.parse(path.read_text()))
+        texts = {node.value for node in nodes if isinstance(node, ast.Constant)}
+        assert not texts & words, path
+    assert knowing == set(KNOW_A_PROTOCOL)
 
 
 def test_only_the_line_knows_serialx_and_only_modbus_knows_pymodbus() -> None:

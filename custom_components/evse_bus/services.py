@@ -1,13 +1,11 @@
-"""Actions: functions of a P-CHARGE EWS-Box that no entity covers.
+"""Actions: functions of a charger that no entity covers; see `actions.table`.
 
 Each takes a device: a box, or one of its ports. The other fields are checked in
 `actions/`, with an error that names the field.
 """
 
-from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING
 
 from homeassistant.const import ATTR_DEVICE_ID
 from homeassistant.core import (
@@ -17,100 +15,21 @@ from homeassistant.core import (
     SupportsResponse,
     callback,
 )
-from homeassistant.helpers import config_validation as cv
 from homeassistant.helpers.service import (
     async_get_device_and_config_entry,
     async_register_admin_service,
 )
-import probatio as vol
 
-from .actions import cards, leds, parameters as blocks
-from .actions.fields import meter_total
+from .actions.table import ACTIONS, Action, Target, has_actions
 from .const import DOMAIN
 from .errors import ActionError, failed_action, translated_errors, wrong_action
 from .evse.errors import NotConfirmedError
-from .evse.ews import EwsPort
 
 if TYPE_CHECKING:
     from homeassistant.helpers.device_registry import AnyDeviceEntry
 
     from .coordinator import BusCoordinator, EvseBusConfigEntry
     from .managed_charger import ManagedCharger
-
-CONF_TOTAL: Final = "total"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Action:
-    """One action: its fields, the required rights, and its function."""
-
-    run: Callable[[EwsPort, Mapping[str, Any]], Awaitable[ServiceResponse]]
-    required: tuple[str, ...] = ()
-    optional: tuple[str, ...] = ()
-    admin: bool = True
-    """Only for administrators: it changes the configuration or returns private data."""
-    responds: bool = False
-    """It returns data and changes nothing."""
-    of_port: bool = False
-    """It applies to one port; the others apply to the whole box."""
-    unconfirmed: ActionError | None = None
-    """Error if the box does not confirm it; ``None``: that of any command."""
-
-    @property
-    def schema(self) -> vol.Schema:
-        """Return the schema of its fields; their values are checked when it runs."""
-        return vol.Schema(
-            {vol.Required(ATTR_DEVICE_ID): cv.string}
-            | {vol.Required(key): cv.match_all for key in self.required}
-            | {vol.Optional(key): cv.match_all for key in self.optional}
-        )
-
-
-async def _set_meter_total(port: EwsPort, given: Mapping[str, object]) -> None:
-    await port.services.set_meter(meter_total(CONF_TOTAL, given[CONF_TOTAL]))
-
-
-def _writes(block: str) -> Action:
-    return Action(
-        run=partial(blocks.write_parameters, block),
-        optional=blocks.keys_of(block),
-        unconfirmed=ActionError.PARAMETERS_NOT_TAKEN,
-    )
-
-
-ACTIONS: Final[Mapping[str, Action]] = {
-    "accept_card": Action(
-        run=cards.accept_card,
-        required=(cards.CONF_GROUP, cards.CONF_NUMBER),
-        optional=(cards.CONF_USER, cards.CONF_TAG),
-        # Not for administrators only: an automation may accept a presented card.
-        admin=False,
-    ),
-    "read_card_list": Action(
-        run=cards.read_card_list, responds=True, unconfirmed=ActionError.NOT_READ
-    ),
-    "write_card_list": Action(
-        run=cards.write_card_list,
-        required=(cards.CONF_ENTRIES,),
-        unconfirmed=ActionError.CARDS_NOT_TAKEN,
-    ),
-    "set_meter_total": Action(
-        run=_set_meter_total, required=(CONF_TOTAL,), of_port=True
-    ),
-    "set_leds": Action(
-        run=leds.set_leds, optional=leds.FIELDS, admin=False, of_port=True
-    ),
-    "read_parameters": Action(
-        run=blocks.read_parameters,
-        required=(blocks.CONF_BLOCK,),
-        responds=True,
-        unconfirmed=ActionError.NOT_READ,
-    ),
-    "write_system_parameters": _writes("system"),
-    "write_network_parameters": _writes("network"),
-    "write_installation_info": _writes("installation"),
-    "write_extra_parameters": _writes("extra"),
-}
 
 
 @callback
@@ -150,7 +69,7 @@ async def _async_run(action: Action, call: ServiceCall) -> ServiceResponse:
 
 def _target(
     call: ServiceCall, *, of_port: bool
-) -> tuple[BusCoordinator, ManagedCharger, EwsPort]:
+) -> tuple[BusCoordinator, ManagedCharger, Target]:
     """Return the charger that an action applies to; raises ServiceValidationError.
 
     The device of a box selects its first port, which serves for the whole box.
@@ -165,8 +84,7 @@ def _target(
     ports = [
         (managed, managed.charger)
         for managed in coordinator.chargers.values()
-        if {managed.key, managed.subentry_id} & keys
-        and isinstance(managed.charger, EwsPort)
+        if {managed.key, managed.subentry_id} & keys and has_actions(managed.charger)
     ]
     if not ports:
         raise wrong_action(ActionError.NOT_EWS_BOX, device=_name(device))
