@@ -1,4 +1,4 @@
-"""What the ports of one EWS-Box share: its identity, its last readings, its clock.
+"""One EWS-Box, shared by its ports: identity, last readings, clock.
 
 Two ports are one box on one line: one ``rc`` and one ``rd`` read both. The box is
 identified when ``id`` and ``rs`` were answered since the line was opened. After a lost
@@ -64,7 +64,7 @@ class Snapshot:
 
 
 class EwsBox:
-    """One box, as its ports know it."""
+    """The box of one bus."""
 
     def __init__(self) -> None:
         """Nothing is known before it answers."""
@@ -85,7 +85,7 @@ class EwsBox:
         self.forget()
 
     def forget(self) -> None:
-        """Drop all readings; the box is identified anew before anything is written."""
+        """Drop all readings; the box is identified again before anything is written."""
         self.firmware: str | None = None
         self.status: BoxStatus | None = None
         self.installation: Installation | None = None
@@ -214,7 +214,7 @@ class EwsBox:
     async def identify(self, turn: Turn) -> None:
         """Read ``id``, ``rs`` and the installation, one exchange a turn.
 
-        Two ports may do so at the same time: each skips what the other has read.
+        Two ports may do so at the same time: each skips the records the other has read.
         Raises what `read` raises.
         """
         while not self._identified:
@@ -323,7 +323,7 @@ class EwsBox:
     # -- Ports ---------------------------------------------------------------------
 
     async def refresh(self, turn: Turn, oldest: float) -> None:
-        """Read what is older than ``oldest`` (loop time, s): up to three exchanges."""
+        """Read the records older than ``oldest`` (loop time, s): up to three exchanges."""
         if self._ports_read_at < oldest or self.details is None:
             await self.read_ports(turn)
             await self.read_details(turn)

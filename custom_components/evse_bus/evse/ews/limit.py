@@ -29,7 +29,7 @@ _LOWEST: Final = Orders(limit=CurrentLimit(current=MINIMUM_CURRENT))
 
 
 class Limiter:
-    """Makes the limit of one port what it should be."""
+    """Sends the limit of one port, and checks that the box follows it."""
 
     def __init__(self, port: BoxPort) -> None:
         """Take the port to speak through."""
@@ -84,7 +84,7 @@ class Limiter:
         reported, status = self.reported, self._port.last_status
         if reported:
             return reported <= limit
-        # It has no limit of ours: what it offers has to do.
+        # No limit is set: the current it offers counts.
         offered = status.offered_current if status is not None else None
         return reported == 0 and offered is not None and 0 < offered <= limit
 
@@ -162,7 +162,7 @@ class Limiter:
     async def _is_read_back(self, turn: Turn, sent: int, *, answered: bool) -> bool:
         """Read the limit back; return whether the box offers that, or less.
 
-        Less is what it can offer; but after a lost reply it may be the limit before.
+        Less may be all it can offer; but after a lost reply, it may be the old limit.
         """
         port = self._port
         try:

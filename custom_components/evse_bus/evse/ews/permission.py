@@ -5,8 +5,8 @@ waiting car starts the next one that comes. So each is sent right after an ``rc`
 the same turn, and only in its states (`states.RULES`); a 6 is repeated only after the
 port has had time to follow; and after a lost reply the next status decides.
 
-In its status, a pause of ours looks like one of the car or the end of a charge. Whose it
-is follows from what was sent and read since (`PauseTracker`).
+By its status alone, a pause of ours could also be one of the car, or the end of a
+charge. `PauseTracker` follows which it is, by the orders sent and the status since.
 """
 
 from collections.abc import Callable
@@ -46,7 +46,7 @@ from .wire.states import (
 from .wire.status import PortStatus, StartRelease
 
 SENDS: Final = 2
-"""Most repetitions of one order in one conversation, the first included."""
+"""How often an order is sent at most in one conversation."""
 _CHARGING: Final = frozenset({CHARGING, CHARGING_OPTIMISED})
 _NO_CAR_WAITS: Final = frozenset({FREE, SEARCHING, ENDED, ABORTED, BLOCKED})
 """There is nothing to start: permission is given without an order."""
@@ -63,26 +63,26 @@ class Pause(Enum):
 class PauseTracker:
     """Follows whether a pause of ours stands at a port.
 
-    | What happens                                         | `pause` after it       |
-    | ---------------------------------------------------- | ---------------------- |
-    | We have just begun: an earlier run may have paused   | POSSIBLE               |
-    | Order 6 is sent                                      | POSSIBLE               |
-    | It is confirmed, or read to be followed              | OURS                   |
-    | It is refused                                        | NONE                   |
-    | A status that is no pause, or the plug was unlocked  | NONE                   |
-    | Order 3 is confirmed, or refused: the charge is over | NONE                   |
-    | A command stops the charge or unlocks the plug       | NONE                   |
-    | The session's counters go back; the box restarts     | POSSIBLE if it was OURS |
+    | Event                                                | `pause` after it         |
+    | ---------------------------------------------------- | ------------------------ |
+    | The tracker starts: an earlier run may have paused   | POSSIBLE                 |
+    | Order 6 is sent                                      | POSSIBLE                 |
+    | It is confirmed, or followed after a lost reply      | OURS                     |
+    | It is refused                                        | NONE                     |
+    | A status that is no pause, or an unlocked plug       | NONE                     |
+    | Order 3 is confirmed, or refused: the charge is over | NONE                     |
+    | A command stops the charge or unlocks the plug       | NONE                     |
+    | The session counters go back, or the box restarts    | POSSIBLE, if it was OURS |
     """
 
     def __init__(self) -> None:
-        """Begin without knowledge of earlier runs; the stored orders do not help.
+        """Start without knowledge of earlier runs.
 
-        The order that led to a pause may have been replaced since.
+        The stored orders do not help: the one that led to a pause may be replaced.
         """
         self.pause = Pause.POSSIBLE
         self.for_current = False
-        """It was for lack of current only: a higher limit ends it."""
+        """Only a limit of 0 A demands it: a higher one ends it."""
         self._sent_at = -inf
         self._last: PortStatus | None = None
         """The last status in which a pause of ours may have stood."""
@@ -108,32 +108,33 @@ class PauseTracker:
         self._sent_at = -inf
 
     def end(self) -> None:
-        """Take note that the pause is over, and that no limit brings it back."""
+        """Take note that the pause is over."""
         self.pause = Pause.NONE
         self.for_current = False
 
     def doubt(self) -> None:
-        """Take note that the pause may be over; no limit ends it any more."""
+        """Take note that the pause may be over; a higher limit no longer ends it."""
         if self.pause is Pause.OURS:
             self.pause = Pause.POSSIBLE
         self.for_current = False
 
     def on_status(self, status: PortStatus, now: float, *, has_lock: bool) -> None:
-        """Check whether the pause still stands; ``has_lock``: plugs are locked here."""
+        """Check by a status whether the pause still stands.
+
+        ``now``: loop time, s. ``has_lock``: the port is known to lock its plugs.
+        """
         if self.pause is Pause.NONE:
-            # Its car goes on or has left: the next one was not paused by us.
+            # The car goes on, or has left: a higher limit must not start the next one.
             self.for_current = False
             return
         before, self._last = self._last, status
-        is_over = _was_unlocked(before, status) or (has_lock and _has_left(status))
-        if status.state in AFTER_OUR_PAUSE and not is_over:
-            stands = True
-        else:
-            stands = status.state in _CHARGING and self.is_settling(now)
-        if not stands:
+        unlocked = _was_unlocked(before, status) or (has_lock and _is_free(status))
+        is_pause = status.state in AFTER_OUR_PAUSE and not unlocked
+        is_settling = status.state in _CHARGING and self.is_settling(now)
+        if not is_pause and not is_settling:
             self.end()
         elif _counters_went_back(before, status):
-            # Another charge; or a box whose counters begin anew with a pause, where a
+            # Another charge, or a box whose counters restart with a pause, where a
             # second order 6 would unlock.
             self.doubt()
 
@@ -142,7 +143,7 @@ def _was_unlocked(before: PortStatus | None, status: PortStatus) -> bool:
     return before is not None and bool(before.locked) and status.locked is False
 
 
-def _has_left(status: PortStatus) -> bool:
+def _is_free(status: PortStatus) -> bool:
     return status.state == ENDED and status.locked is False
 
 
@@ -154,7 +155,7 @@ def _counters_went_back(before: PortStatus | None, status: PortStatus) -> bool:
 
 
 class Permission:
-    """The permission of one port: pauses a charge, and starts one."""
+    """Pauses and starts the charges of one port, and follows whose pause it is in."""
 
     def __init__(self, port: BoxPort) -> None:
         """Take the port to speak through."""
@@ -171,7 +172,7 @@ class Permission:
 
     @property
     def waits_for_current(self) -> bool:
-        """Return whether our own limit of 0 A has paused it: a higher one ends it."""
+        """Return whether a limit of 0 A has paused it, so that a higher one ends it."""
         return self._tracker.for_current
 
     def on_status(self, status: PortStatus) -> None:
@@ -268,7 +269,10 @@ class Permission:
             tracker.for_current = has_followed
 
     async def _send_pause(self, turn: Turn, status: PortStatus) -> None:
-        """Send order 6; a lost reply or a newer status leave it to the next status."""
+        """Send order 6, unless an info record comes first.
+
+        Then, and after a lost reply, the next status decides.
+        """
         port, tracker = self._port, self._tracker
 
         def request() -> Request:
@@ -364,7 +368,7 @@ class Permission:
     ) -> bool:
         """Send order 3; return False where the box is not ready for it yet.
 
-        A lost reply leaves it to the next status.
+        After a lost reply the next status decides.
         """
         port, tracker = self._port, self._tracker
 

@@ -1,8 +1,8 @@
-"""One port of an EWS-Box as a partner of conversation, and the box that ports share.
+"""The conversation with one port of an EWS-Box, and the box that the ports share.
 
-`BoxPort` asks the box and makes sure that it is the right one; `BoxPorts` owns the box
-of one bus and knows its ports. What is made of the replies is up to `reader`, what is
-sent to `charger`. PROTOCOLS.md, 4.
+`BoxPort` identifies the box, reads its own status and sends orders; `BoxPorts` owns the
+box of one bus and knows its ports. `reader` and `charger` build on it and decide.
+PROTOCOLS.md, 4.
 """
 
 from abc import abstractmethod
@@ -87,10 +87,10 @@ class BoxPorts(ChargerGroup):
             slot.due = min(slot.due, deadline - _SOONER)
             slot.start_by = deadline
 
-    # -- What they share -------------------------------------------------------------
+    # -- Their status ----------------------------------------------------------------
 
     def share_status(self, source: BoxPort) -> None:
-        """Let the other ports take what was read by ``source`` in its turn."""
+        """Let the other ports take their status from the reading by ``source``."""
         if not self.box.identified or not self.box.ports:
             return
         for port in self._ports:
@@ -100,7 +100,7 @@ class BoxPorts(ChargerGroup):
 
 
 class BoxPort(Charger[EwsPortConfig]):
-    """One port: who its box is, how its status is read, and when."""
+    """One port: identity of its box, its status, orders to it, and its polls."""
 
     timing: ClassVar = TIMING
 
@@ -142,7 +142,7 @@ class BoxPort(Charger[EwsPortConfig]):
             self.box.on_line_open(self.bus.line.statistics.opened)
         self.last_status = None
 
-    # -- Who answers -----------------------------------------------------------------
+    # -- Identity --------------------------------------------------------------------
 
     async def ready(self, turn: Turn) -> None:
         """Identify the box if it is not known, and check that it is the right one.

@@ -41,7 +41,7 @@ class EwsReader(BoxPort):
         self._implausible = 0
         self._restarts = 0
 
-    # -- What it is and has ------------------------------------------------------
+    # -- Properties --------------------------------------------------------------------
 
     @property
     @override

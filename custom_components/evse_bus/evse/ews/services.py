@@ -43,8 +43,8 @@ LONGEST_READER_TIMEOUT: Final = 10
 class Services:
     """The services of one box, carried out in the turns of one of its ports.
 
-    Beside what is documented, each raises RefusedOrderError for an impossible value,
-    EwsRefusedError, NotConfirmedError for a lost reply, and what `Charger.run` raises.
+    Each may raise RefusedOrderError for an impossible value, EwsRefusedError,
+    NotConfirmedError for a lost reply, and what `Charger.run` raises.
     """
 
     def __init__(self, port: BoxPort) -> None:

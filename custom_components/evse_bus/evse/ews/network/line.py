@@ -201,8 +201,8 @@ class AcceptedLine(Line):
 
     def received(self, data: bytes) -> None:
         """Take bytes of the connection; too many without a reply end it."""
-        # Searching for messages takes long: of a lot of garbage only as much is
-        # searched as it takes to know that it is too much.
+        # Searching for messages takes long: garbage is searched in pieces, up to the
+        # limit that ends the connection.
         for at in range(0, len(data), _PIECE):
             if self._connection is None:
                 return

@@ -280,7 +280,7 @@ class EwsFramer(Framer[EwsFrame]):
 
 
 _TRUSTED_INSIDE: Final = frozenset({"if", *CommandId})
-"""Names that are accepted inside what may be another message."""
+"""Names that are accepted inside a possible other message."""
 
 
 class _Scan:

@@ -187,7 +187,7 @@ class StartStop(IntEnum):
     OPTIMISE = 4
     DO_NOT_OPTIMISE = 5
     PAUSE = 6
-    """Stop, and keep the plug locked. Without a charge it unlocks: `commands.unlock`."""
+    """Stop, and keep the plug locked; without a charge, unlock (`commands.unlock`)."""
     LOCK = 7
 
 

@@ -201,7 +201,7 @@ class Details:
     cable_code: Pair[int] = coded(pair(Number(width=1)))
     """"Low-level cable current detection in A", raw."""
     limit: Pair[int] = coded(pair(Number(width=1, unit="A")))
-    """As set with ``st``, A; 0: none. Not checked: one that is too high is sent again."""
+    """As set with ``st``, A; 0: none. Not checked: a wrong one is sent again."""
     last_card: Pair[Card | None] = coded(pair(optional(CARD)), secret=True)
     """The card of the last charge."""
     last_end: Pair[datetime | None] = coded(pair(Moment()))
