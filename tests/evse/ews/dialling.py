@@ -1,4 +1,4 @@
-"""A listener, boxes that dial it, and time that runs."""
+"""A listener and boxes that dial it, in real time."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -23,9 +23,9 @@ def run(scene: Callable[[], object]) -> None:
     simulate(scene())  # type: ignore[arg-type]
 
 
-async def until(what: Callable[[], object], patience: float = 8.0) -> None:
+async def until(condition: Callable[[], object], patience: float = 8.0) -> None:
     end = now() + patience
-    while not what():
+    while not condition():
         assert now() < end, "it never happened"
         await asyncio.sleep(0.01)
 
@@ -104,7 +104,7 @@ async def goes(client: socket.socket, patience: float = 3.0) -> bool:
 
 
 @contextmanager
-def stranger(made: Listener) -> Iterator[socket.socket]:
+def silent_client(made: Listener) -> Iterator[socket.socket]:
     with socket.create_connection((HOST, made.port)) as client:
         client.setblocking(False)  # noqa: FBT003 - the call takes no keyword
         yield client

@@ -1,4 +1,4 @@
-"""A simulated line with one virtual EWS-Box on it; the wire is the witness."""
+"""A simulated line with one virtual EWS-Box on it; the wire is the oracle."""
 
 import asyncio
 from collections.abc import Callable
@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Self, override
 
 from custom_components.evse_bus.evse.bus import Bus
+from custom_components.evse_bus.evse.errors import PortMissingError
 from custom_components.evse_bus.evse.events import Event
 from custom_components.evse_bus.evse.ews import PROTOCOL
 from custom_components.evse_bus.evse.ews.charger import EwsPort
@@ -36,17 +37,17 @@ class Sent:
 
 
 class EwsLine(SimulatedLine[Sent]):
-    """A wire for each direction; what is not heard can be chosen."""
+    """A wire for each direction; chosen messages can be lost."""
 
     def __init__(self) -> None:
         super().__init__(SETTINGS)
         self.box: VirtualBox | None = None
         self.deaf: Callable[[str], bool] = lambda _name: False
-        """The box does not hear a command."""
+        """Which commands the box does not receive."""
         self.mute: Callable[[str], bool] = lambda _name: False
-        """Its answer is not heard."""
+        """Which answers of the box are lost."""
         self.cut = False
-        """Nothing passes."""
+        """Everything is lost."""
         self.held_until = 0.0
         """Bytes that the box sends before this time arrive then, in their order."""
         self.lumps = 1
@@ -84,7 +85,7 @@ class EwsLine(SimulatedLine[Sent]):
         return [one for one in self.sent if one.name in names and one.when >= since]
 
     def orders(self, order: int | None = None, since: float = 0.0) -> list[Sent]:
-        """Return what was sent as `sl`."""
+        """Return the orders sent (`sl`)."""
         return [
             one
             for one in self.named("sl", since=since)
@@ -118,7 +119,7 @@ class EwsScene(LiveScene):
     box: VirtualBox = field(init=False)
     cars: tuple[Car, Car] = field(init=False)
     events: list[Event] = field(default_factory=list)
-    seen: list[Callable[[], None]] = field(default_factory=list)
+    watchers: list[Callable[[], None]] = field(default_factory=list)
     """Called at each step of the simulated time."""
 
     def __post_init__(self) -> None:
@@ -157,7 +158,7 @@ class EwsScene(LiveScene):
         assert isinstance(charger, EwsPort)
         return charger
 
-    # -- What is to be seen --------------------------------------------------------
+    # -- State ---------------------------------------------------------------------
 
     def charger(self, port: int = 1) -> EwsPort:
         charger = self.bus.chargers[f"port{port}"]
@@ -176,17 +177,17 @@ class EwsScene(LiveScene):
         return self.box.ports[port - 1].status
 
     def unlocked(self, port: int = 1) -> list[str]:
-        """Return why a port's lock has opened."""
+        """Return the reasons why the lock of a port has opened."""
         return [one.reason for one in self.box.ports[port - 1].history.unlockings]
 
     def starts(self, port: int = 1) -> list[str]:
-        """Return what has started a port's charges."""
+        """Return the causes of the starts of a port."""
         return [cause for _, cause in self.box.ports[port - 1].history.starts]
 
     # -- Time ----------------------------------------------------------------------
 
     async def settled(self) -> None:
-        """Wait until all is known, and nothing more is to be said."""
+        """Wait until all is known, and nothing more has to be sent."""
         await self.until(
             lambda: all(
                 one.reading is not None
@@ -197,22 +198,31 @@ class EwsScene(LiveScene):
         )
 
     async def plug(self, port: int = 1) -> None:
-        """Let a car come, and wait until it is seen waiting."""
+        """Plug a car in, and wait until it is read as waiting."""
         self.cars[port - 1].plug_in()
         await self.until(lambda: self.connector(port).raw_state == "0x30")
 
     async def charge(self, port: int = 1) -> None:
-        """Let a car come and charge, on the user's word."""
+        """Plug a car in and let it charge, by order of the user."""
         await self.plug(port)
         await self.charger(port).change_orders(OrderChange(allowed=True))
         await self.until(lambda: self.status(port) == 0x40)
         await asyncio.sleep(2.5)
 
+    def unplug(self, gone: float = 1.0) -> None:
+        """Take the line away; it cannot be opened for a time, s."""
+        self.line.refuse_open = PortMissingError("unplugged")
+        self.line.unplug()
+        asyncio.get_running_loop().call_later(gone, self._replug)
+
+    def _replug(self) -> None:
+        self.line.refuse_open = None
+
     @override
     def step(self) -> None:
         self.box.step()
-        for look in self.seen:
-            look()
+        for watch in self.watchers:
+            watch()
 
     @override
     async def __aenter__(self) -> Self:
@@ -222,7 +232,7 @@ class EwsScene(LiveScene):
 
 
 def play(scene: EwsScene, acts: Callable[[EwsScene], object]) -> EwsScene:
-    """Run what happens in simulated time, once everything is known."""
+    """Run the acts in simulated time, once everything is known."""
 
     async def run() -> None:
         async with scene:
@@ -234,5 +244,5 @@ def play(scene: EwsScene, acts: Callable[[EwsScene], object]) -> EwsScene:
 
 
 def quick(scene: EwsScene, **changes: float) -> EwsScene:
-    """Return a scene whose bus has other times."""
+    """Return a scene with other times of its bus."""
     return replace(scene, timing=replace(scene.timing, **changes))  # type: ignore[arg-type]

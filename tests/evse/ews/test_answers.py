@@ -1,4 +1,4 @@
-"""Which answer is ours, and what each of its codes means."""
+"""Matching of answers, and the meaning of each code."""
 
 import pytest
 
@@ -98,7 +98,7 @@ def test_every_code_of_sl() -> None:
         assert unknown == (code == 8 or code > 12)
 
 
-def test_the_codes_of_sl_have_words_of_their_own() -> None:
+def test_the_codes_of_sl_have_reasons_of_their_own() -> None:
     # 1 and 2 are one reason in the manual.
     assert len(set(START_STOP_CODES.values())) == len(START_STOP_CODES) - 1
 
@@ -123,7 +123,7 @@ def test_a_confirmation_is_one_byte(command: CommandId, data: bytes) -> None:
         confirmed(command)(data)
 
 
-def test_each_command_has_its_own_word_and_each_word_its_message() -> None:
+def test_each_command_has_its_own_reason_and_each_reason_its_message() -> None:
     assert len(set(COMMAND_REFUSALS.values())) == len(COMMAND_REFUSALS)
     assert MESSAGES.keys() == set(Refusal)
     assert len(set(MESSAGES.values())) == len(MESSAGES)

@@ -58,7 +58,7 @@ def test_a_list_is_written_as_it_was_read(data: bytes) -> None:
 
 @given(
     st.binary(min_size=256, max_size=256),
-    # Kinds that say something of somebody else each: twice the same is refused.
+    # Each entry is about another card or group: a duplicate is refused.
     st.dictionaries(
         st.integers(0, 63), st.sampled_from(range(0x40000000, 1 << 32)), min_size=1
     ),
@@ -81,7 +81,7 @@ def test_only_the_entries_that_are_named_are_changed(
         {},
         {64: card_entry(EntryKind.FREE)},
         {-1: card_entry(EntryKind.FREE)},
-        # Twice in what is new, or once there already; also where they disagree.
+        # Twice in the changes, or once in the list already; also with another kind.
         {8: card_entry(EntryKind.GROUP, 9), 9: card_entry(EntryKind.GROUP, 9)},
         {8: card_entry(EntryKind.GROUP, 7)},
         {8: card_entry(EntryKind.CARD, 7, 42)},
@@ -90,9 +90,9 @@ def test_only_the_entries_that_are_named_are_changed(
     ],
 )
 def test_changes_that_make_no_sense(changes: dict[int, CardEntry]) -> None:
-    with pytest.raises(RefusedOrderError) as told:
+    with pytest.raises(RefusedOrderError) as raised:
         decode_cards(LIST).with_entries(changes)
-    assert not any(number in str(told.value) for number in ("42", "43"))
+    assert not any(number in str(raised.value) for number in ("42", "43"))
 
 
 def test_changes_that_make_sense() -> None:
@@ -104,7 +104,7 @@ def test_changes_that_make_sense() -> None:
     # Blocked instead of allowed, in its own place; a card beside its group.
     moved.with_entries({8: card_entry(EntryKind.BLOCKED, 7, 42)})
     cards.with_entries({9: card_entry(EntryKind.CARD, 7, 1)})
-    # What stands there twice keeps nobody from another entry.
+    # Old duplicates do not prevent changes of other entries.
     twice = decode_cards(LIST[:16] + LIST[:16] + LIST[32:])
     assert (
         twice.with_entries({9: card_entry(EntryKind.CARD, 7, 1)}).entries[4:8]
@@ -174,6 +174,6 @@ def test_ma() -> None:
         AcceptedCard(group=1, number=1, tag=b"12345678"),
     ],
 )
-def test_ma_of_what_does_not_fit(card: AcceptedCard) -> None:
+def test_ma_with_values_that_do_not_fit(card: AcceptedCard) -> None:
     with pytest.raises(RefusedOrderError):
         accept_card(card)

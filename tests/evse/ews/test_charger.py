@@ -1,4 +1,4 @@
-"""A port's readings, its set-up, and that it is the right box."""
+"""Readings of a port, its configuration, and the identity of its box."""
 
 import asyncio
 
@@ -28,7 +28,7 @@ def amperes(current: float) -> OrderChange:
     return OrderChange(current=current)
 
 
-def test_what_a_port_tells() -> None:
+def test_reading_of_a_port() -> None:
     async def acts(scene: EwsScene) -> None:
         await scene.charge()
         await asyncio.sleep(60)
@@ -57,7 +57,7 @@ def test_what_a_port_tells() -> None:
     play(EwsScene(), acts)
 
 
-def test_one_rc_tells_of_both_ports() -> None:
+def test_one_rc_reads_both_ports() -> None:
     async def acts(scene: EwsScene) -> None:
         begin = now()
         await asyncio.sleep(60)
@@ -152,7 +152,7 @@ def test_another_box_gets_no_order() -> None:
     simulate(run())
 
 
-def test_a_box_in_the_place_of_another_is_noticed_before_a_word() -> None:
+def test_another_box_is_noticed_before_anything_is_written() -> None:
     async def acts(scene: EwsScene) -> None:
         await scene.charge()
         scene.line.cut = True

@@ -1,4 +1,4 @@
-"""What a box is told, byte by byte, and what it is never told."""
+"""Commands, byte by byte, and those that are refused."""
 
 from datetime import UTC, datetime
 
@@ -77,7 +77,7 @@ def test_reads_have_no_parameters(name: str) -> None:
 
 
 @pytest.mark.parametrize("command", sorted(set(CommandId) - READS))
-def test_what_changes_something_is_no_read(command: CommandId) -> None:
+def test_a_command_that_writes_is_no_read(command: CommandId) -> None:
     with pytest.raises(RefusedOrderError):
         read(command)
 
@@ -98,7 +98,7 @@ def test_sl() -> None:
     assert on_wire(start_stop(1, StartStop.STOP, IDLE)) == b"sl\x01\x01"
 
 
-def test_sl_only_where_it_does_what_it_says() -> None:
+def test_sl_only_in_its_states() -> None:
     with pytest.raises(NotAvailableError):
         start_stop(1, StartStop.PAUSE, WAITING)
     with pytest.raises(NotAvailableError):
@@ -224,7 +224,7 @@ def test_se() -> None:
 @pytest.mark.parametrize(
     ("on", "off"), [(0, 1), (1, 0), (0xFFFF, 1), (-1, 1), (1, 0x10000)]
 )
-def test_what_is_no_blinking(on: int, off: int) -> None:
+def test_times_that_do_not_blink(on: int, off: int) -> None:
     with pytest.raises(RefusedOrderError):
         blinking(on, off)
 

@@ -1,4 +1,4 @@
-"""What an event tells of a charge, and of whom."""
+"""Events of a charge: card, energy, time, result."""
 
 import asyncio
 from dataclasses import replace
@@ -43,7 +43,7 @@ def port(session: tuple[int, int], last: tuple[int, int]) -> PortStatus:
 @pytest.mark.parametrize(
     ("running", "status"),
     [
-        # Taken over; the counters stay, or begin anew.
+        # Taken over; the counters stay, or are reset.
         (port((90, 900), (5, 50)), port((100, 1000), (100, 1000))),
         (port((90, 900), (5, 50)), port((0, 0), (100, 1000))),
         # Taken over with a pause before, and nothing new since.
@@ -53,24 +53,26 @@ def port(session: tuple[int, int], last: tuple[int, int]) -> PortStatus:
         (port((100, 1000), (5, 50)), port((0, 0), (5, 50))),
         # As long as the one before.
         (port((100, 1000), (100, 1000)), port((0, 0), (100, 1000))),
-        # Never seen under way.
+        # Without a status of it under way.
         (None, port((0, 0), (100, 1000))),
     ],
 )
-def test_what_has_been_charged(running: PortStatus | None, status: PortStatus) -> None:
+def test_energy_and_time_of_a_charge(
+    running: PortStatus | None, status: PortStatus
+) -> None:
     ended = charge_ended(2, running, status)
     assert ended == ChargeEnded(
         port=2, result=SessionResult.STOPPED, energy=1000, duration=100
     )
 
 
-def test_who_asks_for_a_start() -> None:
+def test_card_of_a_start_request() -> None:
     card = Card(group=7, number=42, user="MAXMUSTR")
     asked = start_requested(1, replace(IDLE, card=card, optimised=True))
     assert (asked.group, asked.number, asked.optimised) == (7, 42, True)
     assert repr(asked) == "StartRequested(port=1, optimised=True)"
-    nobody = start_requested(2, replace(IDLE, card=None))
-    assert nobody == StartRequested(port=2, optimised=False)
+    without_card = start_requested(2, replace(IDLE, card=None))
+    assert without_card == StartRequested(port=2, optimised=False)
 
 
 # -- On the virtual box --------------------------------------------------------------
@@ -81,7 +83,7 @@ def ends(scene: EwsScene) -> list[ChargeEnded]:
 
 
 class Late(Session):
-    """Takes a charge over when the car has gone, and then begins anew."""
+    """Takes a charge over when the car has left, and resets its counters then."""
 
     def end(self, result: int, at: tuple[int, ...]) -> None:
         self.result, self.last_end = result, at
@@ -93,7 +95,7 @@ class Late(Session):
 
 
 class AtOnce(Session):
-    """Takes a charge over at its end, and begins anew at once."""
+    """Takes a charge over at its end, and resets its counters at once."""
 
     def end(self, result: int, at: tuple[int, ...]) -> None:
         super().end(result, at)
@@ -155,13 +157,13 @@ def test_a_charge_with_a_pause_is_one() -> None:
     play(EwsScene(), acts)
 
 
-def test_an_end_that_nobody_has_seen_is_told_later() -> None:
-    """The line is lost meanwhile; what was under way before our time is no start."""
+def test_an_end_while_the_line_is_lost_is_reported_later() -> None:
+    """A charge that was under way before the line was back is no start."""
 
     async def acts(scene: EwsScene) -> None:
         await scene.charge()
         await asyncio.sleep(60)
-        scene.line.unplug()
+        scene.unplug(5.0)
         scene.cars[0].leave()
         await scene.until(lambda: scene.status() == 0x00)
         await scene.until(lambda: scene.charger().reading is not None)
@@ -169,14 +171,14 @@ def test_an_end_that_nobody_has_seen_is_told_later() -> None:
         (ended,) = ends(scene)
         assert ended.energy == pytest.approx(scene.box.ports[0].session.total_wh, abs=2)
         assert ended.result is SessionResult.PILOT_LOST
-        scene.line.unplug()
+        scene.unplug(5.0)
         scene.cars[0].plug_in()
         await scene.until(lambda: scene.status() == 0x30)
-        scene.box.ports[0].release_start("somebody")
+        scene.box.ports[0].release_start("page")
         await scene.until(lambda: scene.charger().reading is not None)
         await asyncio.sleep(10)
         assert scene.connector().charging
-        scene.line.unplug()
+        scene.unplug(5.0)
         await asyncio.sleep(10)
         assert scene.events.count(ChargeStarted(port=1)) == 1
         assert len(ends(scene)) == 1
@@ -184,7 +186,7 @@ def test_an_end_that_nobody_has_seen_is_told_later() -> None:
     play(EwsScene(), acts)
 
 
-def test_a_start_that_is_asked_for_with_a_card() -> None:
+def test_a_start_that_is_requested_with_a_card() -> None:
     async def acts(scene: EwsScene) -> None:
         scene.box.present_card(VirtualCard(7, 42, "MAX"))
         await scene.plug(2)
@@ -197,8 +199,8 @@ def test_a_start_that_is_asked_for_with_a_card() -> None:
     play(EwsScene(options={"rfid": True}), acts)
 
 
-def test_a_start_that_is_asked_for_before_the_car_is_found() -> None:
-    """Told when a yes counts: said earlier, it would start nobody."""
+def test_a_start_that_is_requested_before_the_car_is_found() -> None:
+    """Reported once permission has an effect: given earlier, it would start nothing."""
 
     async def acts(scene: EwsScene) -> None:
         port = scene.box.ports[0]
@@ -213,8 +215,8 @@ def test_a_start_that_is_asked_for_before_the_car_is_found() -> None:
         assert not [one for one in scene.events if isinstance(one, StartRequested)]
         await scene.until(lambda: scene.connector().start_requested)
         assert scene.status() == 0x30
-        told = [one for one in scene.events if isinstance(one, StartRequested)]
-        assert told == [StartRequested(port=1, optimised=False)]
+        requests = [one for one in scene.events if isinstance(one, StartRequested)]
+        assert requests == [StartRequested(port=1, optimised=False)]
         await scene.charger().change_orders(ON)
         await scene.until(lambda: scene.status() == 0x40)
 

@@ -119,7 +119,7 @@ def test_one_wrong_byte_makes_no_message_but_by_the_other_reading(
     frames, framer = feed(broken)
     framer.reset()
     assert broken not in raws(frames)
-    # Its contents may look like a message to skip.
+    # It may contain a message to skip.
     if not has_message_to_skip(broken):
         assert framer.noise + sum(map(len, raws(frames))) == len(broken)
 
@@ -253,7 +253,7 @@ def test_a_message_that_is_too_long_is_not_waited_for(length: int) -> None:
     assert raws(framer.feed(FIRMWARE)) == [FIRMWARE]
 
 
-def test_a_good_checksum_does_not_help_what_is_too_long() -> None:
+def test_a_message_too_long_is_dropped_despite_its_checksum() -> None:
     frames, framer = feed(answer("mc", bytes(1039)))
     assert not frames
     assert framer.bad == 1
@@ -271,7 +271,7 @@ def test_garbage_does_not_pile_up(chunks: list[bytes]) -> None:
     "pattern", ["02", "0200", "0203ff80", "0203ff41727302", "02000b496966", "020004"]
 )
 def test_garbage_does_not_take_long(pattern: str) -> None:
-    """64 KiB of what looks like heads; a stranger on the network may send it."""
+    """64 KiB of possible heads, as any device on the network may send."""
     garbage = bytes.fromhex(pattern) * (0x10000 * 2 // len(pattern))
     before = process_time()
     feed(garbage)
@@ -323,7 +323,7 @@ def test_a_message_inside_another_that_has_come_whole_is_its_contents() -> None:
 @pytest.mark.parametrize(
     "inner", [message("A", b"xy1"), message("I", b"xy"), message("D", b"xy1")]
 )
-def test_what_nobody_knows_does_not_end_a_message_begun(inner: bytes) -> None:
+def test_an_unknown_message_does_not_end_one_around_it(inner: bytes) -> None:
     outer = answer("ri", inner.ljust(130, b"x"))
     assert raws(feed(*single(outer))[0]) == [outer]
 

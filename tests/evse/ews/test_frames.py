@@ -1,4 +1,4 @@
-"""Messages as the manual prints them, and what may stand of them in a log."""
+"""Messages as the manual prints them, and their bytes for a log."""
 
 from hypothesis import given, strategies as st
 import pytest
@@ -41,7 +41,9 @@ def test_the_command_names_have_the_manuals_codes() -> None:
 
 
 @given(st.sampled_from(MessageId), st.binary(max_size=MAXIMUM_PARAMETERS))
-def test_both_readings_are_what_they_say(kind: MessageId, parameters: bytes) -> None:
+def test_either_checksum_is_right_for_its_kind_only(
+    kind: MessageId, parameters: bytes
+) -> None:
     for bcc, counts_id in ((Bcc.ALL, True), (Bcc.WITHOUT_MESSAGE_ID, False)):
         assert encode(kind, parameters, bcc) == message(
             chr(kind), parameters, counts_id=counts_id
@@ -66,24 +68,24 @@ def test_a_request_shows_no_parameters() -> None:
 
 
 @pytest.mark.parametrize("command", sorted(PRIVATE))
-def test_what_is_private_is_not_logged(command: CommandId) -> None:
+def test_private_messages_are_not_logged(command: CommandId) -> None:
     raw = answer(command, b"secret" * 9)
     assert redacted(raw) == raw[:6] + bytes(len(raw) - 6)
 
 
 def test_addresses_of_the_network_are_not_logged() -> None:
-    """Whatever command tells them: ``rg`` of a box with DHCP as well as ``ru``."""
+    """In any command: ``rg`` of a box with DHCP as well as ``ru``."""
     address = bytes((192, 0, 2, 17))
     for command in (CommandId.READ_DHCP, CommandId.READ_USER, CommandId.WRITE_USER):
         assert address not in redacted(answer(command, address * 7))
 
 
-def test_what_is_not_private_is_logged_as_it_is() -> None:
+def test_other_messages_are_logged_unchanged() -> None:
     for raw in (INFO, answer("sl", b"\x05"), ASKED[Bcc.ALL], answer("zz")):
         assert redacted(raw) == raw
 
 
-def test_of_what_is_no_message_only_the_length_is_logged() -> None:
+def test_of_bytes_without_a_message_only_the_length_is_logged() -> None:
     private = answer("ru", b"secret")
     for raw in (
         b"",

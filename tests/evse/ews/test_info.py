@@ -41,7 +41,7 @@ def test_the_bits(bit: int, change: Change) -> None:
     assert info.key_events == ()
 
 
-def test_bits_that_nobody_knows_are_no_reason_to_fail() -> None:
+def test_unknown_bits_are_ignored() -> None:
     info = decode(message("I", b"if\xff" + bytes(8)))
     assert info is not None
     assert Change.PORT_2 in info.changes
@@ -63,7 +63,7 @@ def test_every_key(at: int, code: int) -> None:
         assert event.held * 10 == pytest.approx(code)
 
 
-def test_what_is_no_such_record() -> None:
+def test_other_frames_are_no_record() -> None:
     assert decode(answer("rc", bytes(9))) is None
     assert decode(message("A", b"if" + bytes(9))) is None
     assert decode(message("C", b"if" + bytes(9))) is None

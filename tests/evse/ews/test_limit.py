@@ -95,7 +95,7 @@ def test_a_limit_is_believed_when_it_is_read_back() -> None:
     play(EwsScene(), acts)
 
 
-def test_a_box_that_never_takes_a_limit_is_not_told_all_the_time() -> None:
+def test_a_limit_that_is_never_followed_is_not_sent_all_the_time() -> None:
     async def acts(scene: EwsScene) -> None:
         begin = now()
         await asyncio.sleep(100)
@@ -123,7 +123,7 @@ def test_a_box_that_takes_less_is_left_in_peace() -> None:
     async def run() -> None:
         scene = EwsScene(current=32.0, ports=(1,))
         scene.box.clamps_limits = True
-        # Something that the box does not tell of keeps it at 20 A.
+        # An unreported limit keeps the box at 20 A.
         scene.box.ports[0].installation.limit = 20
         async with scene:
             await scene.until(lambda: scene.box.ports[0].limit)
@@ -157,7 +157,7 @@ def test_a_refused_limit_leaves_no_open_end(monkeypatch: pytest.MonkeyPatch) -> 
     simulate(run())
 
 
-def test_a_box_with_a_lower_maximum_than_it_tells() -> None:
+def test_a_box_with_a_lower_maximum_than_it_reports() -> None:
     """It refuses, and offers less than that anyhow."""
 
     async def run() -> None:
@@ -177,22 +177,22 @@ def test_a_box_with_a_lower_maximum_than_it_tells() -> None:
 
 
 @pytest.mark.parametrize("current", [10, 20])
-@pytest.mark.parametrize("heard", [True, False])
+@pytest.mark.parametrize("received", [True, False])
 @pytest.mark.parametrize("name", ["st", "rd", "rc"])
-def test_a_limit_with_a_lost_answer(name: str, current: int, *, heard: bool) -> None:
+def test_a_limit_with_a_lost_answer(name: str, current: int, *, received: bool) -> None:
     """A lower one that is read back then is the one before."""
 
     async def acts(scene: EwsScene) -> None:
         left = 1
 
-        def lose(what: str) -> bool:
+        def lose(command: str) -> bool:
             nonlocal left
-            if what != name or not left:
+            if command != name or not left:
                 return False
             left -= 1
             return True
 
-        if heard:
+        if received:
             scene.line.mute = lose
         else:
             scene.line.deaf = lose
@@ -202,7 +202,7 @@ def test_a_limit_with_a_lost_answer(name: str, current: int, *, heard: bool) -> 
     play(EwsScene(), acts)
 
 
-def test_somebody_takes_the_limit_away() -> None:
+def test_a_limit_that_is_switched_off_is_sent_again() -> None:
     async def acts(scene: EwsScene) -> None:
         await scene.charge()
         scene.box.ports[0].limit = 0
@@ -228,7 +228,7 @@ def test_a_restart_is_noticed_and_the_limit_is_back() -> None:
     play(EwsScene(), acts)
 
 
-def test_orders_that_nobody_renews_fall_back_and_start_nothing() -> None:
+def test_expired_orders_fall_back_and_start_nothing() -> None:
     async def acts(scene: EwsScene) -> None:
         await scene.charge()
         await scene.until(lambda: scene.box.ports[0].limit == 8, 80)
@@ -238,7 +238,7 @@ def test_orders_that_nobody_renews_fall_back_and_start_nothing() -> None:
     play(EwsScene(lifetime=60.0, fail_safe=8.0), acts)
 
 
-def test_a_lower_installation_limit_does_not_wait_for_what_has_failed(
+def test_a_lower_installation_limit_is_sent_at_once_after_a_failure(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Something else that failed just now, such as a clock that cannot be set."""

@@ -1,4 +1,4 @@
-"""Boxes that dial us, and the bus that is theirs."""
+"""Boxes that dial, and the bus of each."""
 
 import asyncio
 
@@ -35,7 +35,7 @@ from .dialling import (
 pytestmark = pytest.mark.usefixtures("socket_enabled")
 
 
-def test_nobody_has_dialled_yet_and_all_is_well() -> None:
+def test_a_bus_waits_for_its_box_to_dial() -> None:
     async def scene() -> None:
         async with server() as made, expected(made) as bus:
             await asyncio.sleep(0.1)
@@ -69,16 +69,16 @@ def test_a_box_dials_and_charges() -> None:
     run(scene)
 
 
-def test_a_stranger_is_told_of_and_gets_nothing_but_its_identification() -> None:
+def test_an_unknown_box_is_reported_and_only_identified() -> None:
     async def scene() -> None:
-        told: list[UnknownBox] = []
+        found: list[UnknownBox] = []
         box = VirtualBox(serial="099999999999")
-        async with server(on_unknown_box=told.append) as made:
+        async with server(on_unknown_box=found.append) as made:
             with dialling(made, box):
-                await until(lambda: told)
+                await until(lambda: found)
                 await asyncio.sleep(0.3)
-                assert told[0].serial == "099999999999"
-                assert str(told[0].peer) == HOST
+                assert found[0].serial == "099999999999"
+                assert str(found[0].peer) == HOST
                 assert {one.name for one in box.commands} == {"id", "rs"}
                 async with expected(made, "099999999999") as bus:
                     # Set up meanwhile: the connection that is there is taken.
@@ -199,7 +199,7 @@ def test_a_box_that_begins_to_talk_nonsense_is_hung_up_on() -> None:
     run(scene)
 
 
-def test_what_has_happened_meanwhile_is_told() -> None:
+def test_records_during_identification_reach_the_bus() -> None:
     """Keys that were pressed without a server come before the first question."""
 
     async def scene() -> None:
@@ -251,7 +251,7 @@ def test_fifty_boxes() -> None:
             )
             with fleet:
                 await until(lambda: all(map(has_reading, buses)), 30)
-                # All have dialled in the same moment, and nobody had to do so twice.
+                # All have dialled in the same moment, and none had to dial twice.
                 assert made.statistics.accepted == len(boxes)
                 assert made.statistics.crowded_out == 0
                 await until(lambda: all(box.ports[0].limit == 16 for box in boxes), 30)

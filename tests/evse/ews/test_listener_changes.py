@@ -1,4 +1,4 @@
-"""A listener that changes while it runs: who may dial, who is set up, who is there."""
+"""A listener that changes while it runs: allowed networks, registered boxes."""
 
 import asyncio
 from ipaddress import ip_address, ip_network
@@ -21,7 +21,7 @@ from .dialling import (
     has_reading,
     run,
     server,
-    stranger,
+    silent_client,
     until,
 )
 
@@ -33,20 +33,20 @@ HERE = ip_network("127.0.0.0/8")
 
 
 def is_empty(made: Listener) -> bool:
-    """Return whether nothing is kept of anybody."""
+    """Return whether no connection is left."""
     kept = (made._unidentified, made._identified, made._unknown, made._bound)
     return not any(kept) and not made._timers
 
 
-def test_who_may_not_connect_any_more_is_hung_up_on() -> None:
-    """Set up or not, or just about to say who it is."""
+def test_connections_that_are_no_longer_allowed_end() -> None:
+    """Registered or not, or not identified yet."""
 
     async def scene() -> None:
         async with server() as made, expected(made) as bus:
             with (
                 dialling(made) as box,
                 dialling(made, VirtualBox(serial=OTHER)) as other,
-                stranger(made) as silent,
+                silent_client(made) as silent,
             ):
                 await until(lambda: has_reading(bus) and made.unknown_boxes)
                 made.allow([HERE])
@@ -60,7 +60,7 @@ def test_who_may_not_connect_any_more_is_hung_up_on() -> None:
                 assert await goes(silent)
                 assert not bus.connected
                 assert made.allowed == (ELSEWHERE,)
-                # They go on dialling, and are not let in.
+                # They go on dialling, and are not accepted.
                 await until(lambda: made.statistics.not_allowed > before + 5)
                 assert is_empty(made)
                 assert not first(bus).available
@@ -70,7 +70,7 @@ def test_who_may_not_connect_any_more_is_hung_up_on() -> None:
     run(scene)
 
 
-def test_one_that_waits_to_take_a_place_is_hung_up_on(
+def test_a_connection_that_waits_to_replace_another_ends(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(listening, "PROOF_TIME", 2.0)
@@ -89,7 +89,7 @@ def test_one_that_waits_to_take_a_place_is_hung_up_on(
     run(scene)
 
 
-def test_who_is_there() -> None:
+def test_connected_boxes() -> None:
     async def scene() -> None:
         async with server() as made, expected(made) as bus:
             assert not made.unknown_boxes
@@ -110,7 +110,7 @@ def test_who_is_there() -> None:
     run(scene)
 
 
-def test_a_stranger_that_is_set_up_in_time_stays(
+def test_an_unknown_box_that_is_registered_in_time_stays(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(listening, "UNKNOWN_TIME", 0.5)
@@ -126,7 +126,7 @@ def test_a_stranger_that_is_set_up_in_time_stays(
                     assert not box.dropped
                     assert box.opened == 1
                     assert has_reading(bus)
-                # It is a stranger again, and then kept for so long only.
+                # It is unknown again, and kept for so long only.
                 await until(lambda: made.unknown_boxes)
                 times = box.opened
                 await until(lambda: box.opened > times)
@@ -135,8 +135,8 @@ def test_a_stranger_that_is_set_up_in_time_stays(
     run(scene)
 
 
-def test_a_box_that_gives_another_number_later_keeps_nobody_out() -> None:
-    """The one that is set up would be refused as long as somebody answers for it."""
+def test_a_box_that_gives_another_number_later_is_dropped() -> None:
+    """The registered one would be refused as long as another answers for it."""
 
     async def scene() -> None:
         false = VirtualBox(serial=SERIAL)
@@ -170,7 +170,7 @@ def test_a_listener_that_stops_leaves_no_connection_behind(
             with (
                 dialling(made) as box,
                 dialling(made, VirtualBox(serial=OTHER)),
-                stranger(made) as silent,
+                silent_client(made) as silent,
             ):
                 await until(lambda: has_reading(bus) and made.unknown_boxes)
                 box.vanish()
@@ -195,8 +195,8 @@ def test_an_interface_that_is_not_there_or_not_named(host: str) -> None:
     run(scene)
 
 
-def test_what_is_no_host_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Names are not asked for in tests: one too long raises UnicodeEncodeError."""
+def test_an_invalid_host(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tests resolve no names; one that is too long raises UnicodeEncodeError."""
 
     async def scene() -> None:
         loop = asyncio.get_running_loop()

@@ -1,4 +1,4 @@
-"""Pausing and starting, whatever gets lost or restarts: nothing is unlocked."""
+"""Pausing and starting with lost answers and restarts: nothing is unlocked."""
 
 import asyncio
 from contextlib import suppress
@@ -27,10 +27,10 @@ def amperes(current: float) -> OrderChange:
 
 
 @pytest.mark.parametrize("pause_status", [0x50, 0x42])
-@pytest.mark.parametrize("heard", [True, False])
+@pytest.mark.parametrize("received", [True, False])
 @pytest.mark.parametrize("times", [1, 2])
-def test_a_pause_whose_answer_is_lost(
-    *, heard: bool, times: int, pause_status: int
+def test_a_pause_with_a_lost_answer(
+    *, received: bool, times: int, pause_status: int
 ) -> None:
     """Also two in a row: never is there a 6 where the first one has worked."""
 
@@ -47,7 +47,7 @@ def test_a_pause_whose_answer_is_lost(
             left -= 1
             return True
 
-        if heard:
+        if received:
             scene.line.mute = lose
         else:
             scene.line.deaf = lose
@@ -55,7 +55,7 @@ def test_a_pause_whose_answer_is_lost(
             await scene.charger().change_orders(OFF)
         await asyncio.sleep(40)
         sixes = scene.line.orders(PAUSE, since=begin)
-        assert len(sixes) == (1 if heard else times + 1)
+        assert len(sixes) == (1 if received else times + 1)
         assert scene.status() == pause_status
         assert scene.box.ports[0].locked
         assert not scene.unlocked()
@@ -91,8 +91,8 @@ def test_a_pause_while_other_answers_are_lost(lost: str, count: int) -> None:
 
 
 @pytest.mark.parametrize("late", [0.49, 0.501, 0.503, 0.506, 0.52, 0.8, 1.02, 1.6])
-def test_a_late_answer_to_an_older_look_is_not_trusted(late: float) -> None:
-    """It says that the car charges; it does not any more when we order the pause."""
+def test_a_late_answer_to_an_older_rc_is_not_used(late: float) -> None:
+    """By it the car charges, but no longer when the pause is ordered."""
 
     async def acts(scene: EwsScene) -> None:
         await scene.charge()
@@ -100,7 +100,7 @@ def test_a_late_answer_to_an_older_look_is_not_trusted(late: float) -> None:
         scene.line.held_until = now() + late
         scene.charger().poll_now()
         await asyncio.sleep(0.3)
-        # The cable stays locked, as after a pause of somebody else's.
+        # The cable stays locked, as after a stop at the box.
         scene.box.ports[0].pause()
         with suppress(EvseError):
             await scene.charger().change_orders(OFF)
@@ -111,8 +111,8 @@ def test_a_late_answer_to_an_older_look_is_not_trusted(late: float) -> None:
     play(EwsScene(), acts)
 
 
-@pytest.mark.parametrize("heard", [True, False])
-def test_a_start_whose_answer_is_lost(*, heard: bool) -> None:
+@pytest.mark.parametrize("received", [True, False])
+def test_a_start_with_a_lost_answer(*, received: bool) -> None:
     async def acts(scene: EwsScene) -> None:
         await scene.plug()
         left = 1
@@ -124,13 +124,13 @@ def test_a_start_whose_answer_is_lost(*, heard: bool) -> None:
             left -= 1
             return True
 
-        if heard:
+        if received:
             scene.line.mute = lose
         else:
             scene.line.deaf = lose
         await scene.charger().change_orders(ON)
         await scene.until(lambda: scene.status() == 0x40)
-        assert len(scene.line.orders(START)) == (1 if heard else 2)
+        assert len(scene.line.orders(START)) == (1 if received else 2)
 
     play(EwsScene(), acts)
 
@@ -175,10 +175,10 @@ def test_it_does_not_wait_for_ever() -> None:
     play(EwsScene(options={"power_backup": True}), acts)
 
 
-def test_a_refusal_says_why() -> None:
+def test_a_refusal_has_its_reason() -> None:
     async def acts(scene: EwsScene) -> None:
         await scene.plug()
-        # The lock jams after the look at it.
+        # The lock jams after the status was read.
         scene.box.ports[0].release_start = lambda _why: None  # type: ignore[method-assign]
         scene.line.deaf = lambda name: (
             scene.box.trip_rcd(1) or True if name == "none" else False
@@ -191,15 +191,15 @@ def test_a_refusal_says_why() -> None:
             return original(data, reply_may_equal=reply_may_equal)
 
         scene.line.write = write  # type: ignore[method-assign]
-        with pytest.raises(EwsRefusedError) as told:
+        with pytest.raises(EwsRefusedError) as raised:
             await scene.charger().change_orders(ON)
-        assert told.value.reason is Refusal.RCD
+        assert raised.value.reason is Refusal.RCD
 
     play(EwsScene(), acts)
 
 
 @pytest.mark.parametrize("pause_status", [0x50, 0x42])
-def test_a_restart_of_ours_does_not_unlock_what_we_have_paused(
+def test_a_restart_of_ours_does_not_unlock_a_paused_charge(
     pause_status: int,
 ) -> None:
     async def acts(scene: EwsScene) -> None:
@@ -228,7 +228,7 @@ def test_a_pause_lives_through_a_lost_line() -> None:
     async def acts(scene: EwsScene) -> None:
         await scene.charge()
         await scene.charger().change_orders(OFF)
-        scene.line.unplug()
+        scene.unplug()
         await asyncio.sleep(5)
         await scene.until(lambda: scene.charger().reading is not None)
         await asyncio.sleep(20)
@@ -246,7 +246,7 @@ def test_a_line_lost_with_the_pause_on_its_way() -> None:
         scene.line.mute = lambda name: name == "sl"
         task = asyncio.ensure_future(scene.charger().change_orders(OFF))
         await scene.until(lambda: scene.status() == 0x50)
-        scene.line.unplug()
+        scene.unplug()
         with pytest.raises(EvseError):
             await task
         await scene.until(lambda: scene.charger().reading is not None)
@@ -260,7 +260,7 @@ def test_a_line_lost_with_the_pause_on_its_way() -> None:
     play(EwsScene(), acts)
 
 
-def test_somebody_unlocks_what_we_have_paused() -> None:
+def test_a_paused_charge_that_is_unlocked_at_the_box() -> None:
     async def acts(scene: EwsScene) -> None:
         await scene.charge()
         await scene.charger().change_orders(OFF)

@@ -1,4 +1,4 @@
-"""A port that is set up and that the box does not have: the other one goes on."""
+"""A configured port that the box does not have: the other one goes on."""
 
 import asyncio
 
@@ -24,7 +24,7 @@ async def reinstall(scene: EwsScene, ports: int) -> None:
     await asyncio.sleep(15)
 
 
-def test_it_is_told_and_gets_no_word() -> None:
+def test_a_missing_port_is_a_fault_and_gets_no_order() -> None:
     async def run() -> None:
         async with one_port() as scene:
             await scene.until(lambda: scene.charger().reading is not None)
@@ -70,7 +70,7 @@ def test_the_other_one_keeps_its_times(order: tuple[int, ...], interval: float) 
             assert asked <= 600 / min(interval, 12) + 10
             if interval == 2.0:
                 assert asked >= 290
-            # A record is followed by a reading at once, whoever hears it.
+            # A record is followed by a reading at once, by either port.
             scene.cars[0].plug_in()
             await scene.until(lambda: scene.status() == 0x30)
             began = now()
@@ -86,19 +86,19 @@ def test_it_comes_and_goes() -> None:
         async with one_port() as scene:
             await scene.until(lambda: scene.charger().reading is not None)
             await asyncio.sleep(10)
-            told: list[bool] = []
+            missing: list[bool] = []
             port = scene.charger(2)
-            port.subscribe(lambda: told.append(Fault.NO_SUCH_PORT in port.faults))
+            port.subscribe(lambda: missing.append(Fault.NO_SUCH_PORT in port.faults))
             await reinstall(scene, 2)
             await scene.until(lambda: port.available and port.reading, 400)
             assert not port.faults
-            assert not told[-1]
+            assert not missing[-1]
             await port.change_orders(OrderChange(current=10.0))
             assert scene.box.ports[1].limit == 10
             await reinstall(scene, 1)
             assert not port.available
             assert port.reading is None
             assert port.faults == {Fault.NO_SUCH_PORT}
-            assert told[-1]
+            assert missing[-1]
 
     simulate(run())

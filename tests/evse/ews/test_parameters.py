@@ -34,12 +34,12 @@ from .wire import message
 SYSTEM = (
     b"topsecret\0\0\0"
     + bytes.fromhex("02")  # ports
-    + bytes.fromhex("e3")  # server, with cards; three bits that nobody knows
+    + bytes.fromhex("e3")  # server, with cards; three unknown bits
     + bytes.fromhex("000003e8")  # 1000 pulses a kWh
     + bytes.fromhex("01")  # Walther
     + b"4711"
     + bytes.fromhex("01 10 01")  # ventilation, 16 A, restart
-    + bytes.fromhex("84")  # port 2 in mode 1; a bit that nobody knows
+    + bytes.fromhex("84")  # port 2 in mode 1; an unknown bit
 )
 USER = (
     b"mypass\0\0\0\0\0\0"
@@ -156,7 +156,7 @@ def test_a_change_on_the_wire(
     assert request.encode(Bcc.ALL) == message("C", block.write.encode() + after)
 
 
-def test_bits_that_nobody_knows_are_kept() -> None:
+def test_unknown_bits_are_kept() -> None:
     mode = SYSTEM_BLOCK.decode(SYSTEM).mode
     request = SYSTEM_BLOCK.change(SYSTEM, {"mode": mode | SystemMode.EXCLUSIVE})
     assert request.parameters[13] == 0xF3
@@ -167,7 +167,7 @@ def test_bits_that_nobody_knows_are_kept() -> None:
 
 
 @given(st.binary(min_size=53, max_size=53), st.integers(0, 0xFFFF))
-def test_what_is_reserved_is_kept(reserved: bytes, voltage: int) -> None:
+def test_reserved_bytes_are_kept(reserved: bytes, voltage: int) -> None:
     before = EXTRA[:11] + reserved
     after = EXTRA_BLOCK.change(before, {"voltage_1": voltage}).parameters
     assert after == before[:5] + voltage.to_bytes(2) + before[7:]
@@ -215,7 +215,7 @@ def test_a_box_without_ports_is_not_believed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("secret", "told"),
+    ("secret", "expected"),
     [
         (b"topsecret\0\0\0", Shown.SHOWN),
         (b"topsecret   ", Shown.SHOWN),
@@ -234,17 +234,17 @@ def test_a_box_without_ports_is_not_believed() -> None:
         (bytes(4), Shown.EMPTY),
     ],
 )
-def test_whether_a_secret_was_read(secret: bytes, told: Shown) -> None:
-    assert shown(secret) is told
+def test_whether_a_secret_was_read(secret: bytes, expected: Shown) -> None:
+    assert shown(secret) is expected
 
 
 @given(st.binary(min_size=12, max_size=12))
-def test_whether_a_secret_was_read_can_be_said_later(secret: bytes) -> None:
+def test_whether_a_secret_was_read_is_known_from_the_block(secret: bytes) -> None:
     text = secret.split(b"\0")[0].decode("latin-1")
     # Spaces around a text are not kept.
     assume(text == text.strip())
-    told = USER_BLOCK.decode(secret + USER[12:])
-    assert USER_BLOCK.shown_secrets(told) == {"user_password": shown(secret)}
+    block = USER_BLOCK.decode(secret + USER[12:])
+    assert USER_BLOCK.shown_secrets(block) == {"user_password": shown(secret)}
 
 
 @pytest.mark.parametrize(
@@ -255,7 +255,7 @@ def test_whether_a_secret_was_read_can_be_said_later(secret: bytes) -> None:
     ],
 )
 @pytest.mark.parametrize("hidden", [bytes(12), 12 * b"*", b"***" + bytes(9)])
-def test_a_password_that_is_not_told_is_not_erased(
+def test_a_hidden_password_is_not_erased(
     *,
     block: Block[object],
     data: bytes,
@@ -266,14 +266,14 @@ def test_a_password_that_is_not_told_is_not_erased(
     masked = hidden + data[12:]
     with pytest.raises(RefusedOrderError, match=name):
         block.change(masked, change)
-    # Unless somebody says what it is to be, be it none.
+    # Unless it is given, be it empty.
     for password in ("", "new"):
         request = block.change(masked, change | {name: password})
         assert request.parameters[:12] == password.encode().ljust(12, b"\0")
 
 
 @pytest.mark.parametrize("hidden", [b"****", bytes(4)])
-def test_a_pin_that_is_not_told_is_not_erased(hidden: bytes) -> None:
+def test_a_hidden_pin_is_not_erased(hidden: bytes) -> None:
     masked = SYSTEM[:19] + hidden + SYSTEM[23:]
     with pytest.raises(RefusedOrderError, match="card_pin"):
         SYSTEM_BLOCK.change(masked, {"ports": 1, "admin_password": "new"})
@@ -282,12 +282,12 @@ def test_a_pin_that_is_not_told_is_not_erased(hidden: bytes) -> None:
         assert request.parameters[19:23] == pin.encode().ljust(4, b"\0")
 
 
-def test_a_password_that_is_told_goes_back_as_it_was() -> None:
+def test_a_password_that_was_read_is_written_unchanged() -> None:
     padded = b"topsecret \x00\x7f" + SYSTEM[12:]
     assert SYSTEM_BLOCK.change(padded, {"ports": 1}).parameters[:12] == padded[:12]
 
 
-def test_no_repr_and_no_error_tells_what_is_private() -> None:
+def test_no_repr_and_no_error_has_private_data() -> None:
     text = "".join(
         repr(block.decode(data))
         for block, data in (

@@ -1,4 +1,4 @@
-"""Whose pause it is: each event of `PauseTracker`, and the pause after it."""
+"""The table of `PauseTracker`: each event, and the pause after it."""
 
 from dataclasses import replace
 

@@ -106,7 +106,7 @@ def test_a_start_is_sent_only_to_a_car_that_waits(status: int) -> None:
     play(EwsScene(), acts)
 
 
-def test_a_car_that_comes_later_is_not_started_by_an_old_word() -> None:
+def test_a_car_that_comes_later_is_not_started_by_an_old_order() -> None:
     async def acts(scene: EwsScene) -> None:
         await scene.charger().change_orders(ON)
         await scene.plug()
@@ -125,7 +125,7 @@ def test_a_car_that_comes_later_is_not_started_by_an_old_word() -> None:
     play(EwsScene(), acts)
 
 
-def test_a_pause_of_somebody_else_is_not_ended_by_us() -> None:
+def test_a_stop_at_the_box_is_not_ended_by_us() -> None:
     async def acts(scene: EwsScene) -> None:
         await scene.charge()
         scene.box.press_key(1, 2)
@@ -148,7 +148,7 @@ def test_a_limit_of_zero_pauses_and_a_higher_one_goes_on() -> None:
         assert scene.status() == 0x50
         assert scene.charger().waits_for_current
         await asyncio.sleep(20)
-        # What counts if somebody starts it at the box.
+        # This limit counts if it is started at the box.
         assert scene.box.ports[0].limit == 6
         await scene.charger().change_orders(amperes(12.0))
         await scene.until(lambda: scene.status() == 0x40)
@@ -201,7 +201,7 @@ def test_a_start_at_the_box_against_a_pause_is_paused_again() -> None:
         assert not scene.unlocked()
 
     scene = EwsScene(options={"mode": "standalone"})
-    scene.seen.append(
+    scene.watchers.append(
         lambda: (
             scene.box.start_on_web_page(1)
             if scene.status() == 0x30 and not scene.starts()
@@ -226,7 +226,7 @@ def test_a_charge_that_the_box_aborts_has_not_started() -> None:
     play(EwsScene(), acts)
 
 
-def test_a_socket_that_may_never_charge_says_so() -> None:
+def test_a_socket_that_may_never_charge_raises() -> None:
     """Mode 1 has 16 A or nothing, and the wiring has less."""
 
     async def acts(scene: EwsScene) -> None:

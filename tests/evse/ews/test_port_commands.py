@@ -1,4 +1,4 @@
-"""The clock, and what a person orders once."""
+"""The clock, and the commands of a person."""
 
 import asyncio
 from dataclasses import replace
@@ -123,9 +123,9 @@ def test_stop_and_unlock_after_a_pause() -> None:
     play(EwsScene(), acts)
 
 
-@pytest.mark.parametrize("heard", [True, False])
-def test_the_other_commands(*, heard: bool) -> None:
-    """A lost answer decides nothing: the next look does."""
+@pytest.mark.parametrize("received", [True, False])
+def test_the_other_commands(*, received: bool) -> None:
+    """A lost answer decides nothing: the next status does."""
 
     async def acts(scene: EwsScene) -> None:
         charger = scene.charger()
@@ -146,13 +146,13 @@ def test_the_other_commands(*, heard: bool) -> None:
         def lose(name: str) -> bool:
             return bool(lost) and name == "sl" and bool(lost.pop())
 
-        if heard:
+        if received:
             scene.line.mute = lose
         else:
             scene.line.deaf = lose
         await charger.command(Command.LOCK)
         assert scene.box.ports[0].locked
-        assert len(scene.line.orders(7)) == (1 if heard else 2)
+        assert len(scene.line.orders(7)) == (1 if received else 2)
         await charger.command(Command.REQUEST_START)
         assert scene.connector().start_requested
         assert not scene.unlocked()
@@ -171,7 +171,7 @@ def test_a_request_that_is_lost_is_not_made_again() -> None:
     play(EwsScene(), acts)
 
 
-def test_a_plug_that_does_not_come_free_is_told() -> None:
+def test_a_plug_that_does_not_come_free_raises() -> None:
     async def acts(scene: EwsScene) -> None:
         await scene.charge()
         scene.box.ports[0].lock.jammed = "unlock"
@@ -182,7 +182,7 @@ def test_a_plug_that_does_not_come_free_is_told() -> None:
     play(EwsScene(), acts)
 
 
-def test_a_reset_that_nobody_answers() -> None:
+def test_an_unanswered_reset() -> None:
     async def acts(scene: EwsScene) -> None:
         scene.line.mute = lambda name: name == "zz"
         with pytest.raises(NotConfirmedError):
@@ -192,7 +192,7 @@ def test_a_reset_that_nobody_answers() -> None:
     play(EwsScene(), acts)
 
 
-def test_nothing_private_is_kept_of_what_passed(
+def test_no_private_data_are_kept_in_the_frame_log(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level(logging.DEBUG)

@@ -1,4 +1,4 @@
-"""What is made of what a box tells, and which words a port has."""
+"""Reading, capabilities and limits from the records of a box."""
 
 import asyncio
 from dataclasses import replace
@@ -41,7 +41,7 @@ ALWAYS = {
 
 
 def connector(port: int = 1, **changes: object) -> ConnectorReading:
-    """Return what is made of one port, with fields of its status changed."""
+    """Return the reading of one port, with fields of its status changed."""
     ports = list(decode_ports(PORTS))
     ports[port - 1] = replace(ports[port - 1], **changes)  # type: ignore[arg-type]
     snapshot = Snapshot(
@@ -57,21 +57,21 @@ def connector(port: int = 1, **changes: object) -> ConnectorReading:
 
 @pytest.mark.parametrize("result", ChargeResult)
 def test_how_a_charge_has_ended(result: ChargeResult) -> None:
-    told = connector(result_code=result).last_result
-    assert told is not None
-    assert told.name == result.name
+    reading = connector(result_code=result).last_result
+    assert reading is not None
+    assert reading.name == result.name
 
 
-def test_every_result_has_a_word() -> None:
+def test_every_result_has_a_neutral_one() -> None:
     assert {one.name for one in ChargeResult} == {one.name for one in SessionResult}
 
 
 @pytest.mark.parametrize("code", [0, 2, 10, 255])
-def test_an_end_that_the_manual_does_not_know_is_not_told(code: int) -> None:
+def test_an_unknown_result_is_none(code: int) -> None:
     assert connector(result_code=code).last_result is None
 
 
-def test_who_is_logged_in_is_told_and_not_shown() -> None:
+def test_the_card_is_read_and_not_shown() -> None:
     known = connector(card=Card(group=1, number=2, user="MAXMUSTR"))
     assert known.user == "MAXMUSTR"
     assert "MAXMUSTR" not in repr(known)
@@ -79,20 +79,20 @@ def test_who_is_logged_in_is_told_and_not_shown() -> None:
     assert connector(card=None).user is None
 
 
-def test_the_bits_and_voltages_are_told_of_the_right_port() -> None:
+def test_the_bits_and_voltages_are_of_the_right_port() -> None:
     details = decode_details(DETAILS)
     for port in (1, 2):
-        seen = decode_ports(PORTS)[port - 1]
-        told = connector(port)
-        assert told.rcd_tripped is seen.rcd_tripped
-        assert told.pilot_low == seen.pwm_minimum
-        assert told.pilot_high == seen.pwm_maximum
-        assert told.proximity_voltage == seen.cable_voltage
-        assert told.last_end == details.last_end[port - 1]
-        assert told.energy == seen.total_energy
+        status = decode_ports(PORTS)[port - 1]
+        reading = connector(port)
+        assert reading.rcd_tripped is status.rcd_tripped
+        assert reading.pilot_low == status.pwm_minimum
+        assert reading.pilot_high == status.pwm_maximum
+        assert reading.proximity_voltage == status.cable_voltage
+        assert reading.last_end == details.last_end[port - 1]
+        assert reading.energy == status.total_energy
 
 
-# -- Which words a port has ----------------------------------------------------------
+# -- Capabilities -------------------------------------------------------------------
 
 
 def test_a_port_in_mode_3_has_a_pilot() -> None:
@@ -119,7 +119,7 @@ def test_a_household_socket_has_none() -> None:
         (SystemMode(0xFF), True, True),
     ],
 )
-def test_cards_and_keys_are_there_as_the_parameters_say(
+def test_cards_and_keys_depend_on_the_parameters(
     mode: SystemMode | None, *, cards: bool, keys: bool
 ) -> None:
     known = capabilities_of(1, Installation(mode=mode))
@@ -128,7 +128,7 @@ def test_cards_and_keys_are_there_as_the_parameters_say(
 
 
 def test_before_the_parameters_are_known() -> None:
-    """What may turn out not to be there is not promised."""
+    """Capabilities that the parameters may take away are left out before."""
     known = capabilities_of(2, None)
     assert known >= ALWAYS
     assert not known & (MODE_3 | {Capability.CARDS, Capability.KEYS})
@@ -137,7 +137,7 @@ def test_before_the_parameters_are_known() -> None:
 # -- On the virtual box --------------------------------------------------------------
 
 
-def test_what_a_charge_with_a_card_tells() -> None:
+def test_reading_of_a_charge_with_a_card() -> None:
     async def acts(scene: EwsScene) -> None:
         scene.box.set_clock(scene.box.clock().replace(year=2026))
         assert scene.connector(2).last_result is None

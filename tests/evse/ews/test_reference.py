@@ -1,4 +1,4 @@
-"""The documentation has every command, what makes it, and what tests it."""
+"""The documentation has every command, with its code and its test."""
 
 from importlib import import_module
 from pathlib import Path
@@ -24,14 +24,14 @@ def test_every_command_has_its_row() -> None:
 
 
 @pytest.mark.parametrize("name", ROWS)
-def test_a_row_names_what_there_is(name: str) -> None:
+def test_a_row_names_existing_code_and_tests(name: str) -> None:
     *_, code, test, where = ROWS[name]
     for one in code.split(", "):
-        module, what = one.strip("`").split(".")
-        assert hasattr(import_module(f"{LIBRARY}.{module}"), what)
-    module, what = test.strip("`").split(".")
-    assert hasattr(import_module(f"tests.evse.ews.{module}"), what)
-    # What it says is looked up where Home Assistant is known: tests/test_docs.py.
+        module, attribute = one.strip("`").split(".")
+        assert hasattr(import_module(f"{LIBRARY}.{module}"), attribute)
+    module, attribute = test.strip("`").split(".")
+    assert hasattr(import_module(f"tests.evse.ews.{module}"), attribute)
+    # Its contents are checked in tests/test_docs.py, with Home Assistant.
     assert where
 
 
@@ -39,7 +39,7 @@ def test_every_state_and_every_order_is_there() -> None:
     for code in STATES:
         assert f"0x{code:02X}" in PAGE or code in range(0x40, 0x44)
     orders = PAGE.split("## Orders and their states")[1].split("\n## ")[0]
-    told = re.findall(r"^\| ([1-7])(?:, ([1-7]))?", orders, re.MULTILINE)
+    numbered = re.findall(r"^\| ([1-7])(?:, ([1-7]))?", orders, re.MULTILINE)
     # Order 6 has two rows: it does two things.
-    numbers = dict.fromkeys(int(one) for pair in told for one in pair if one)
+    numbers = dict.fromkeys(int(one) for pair in numbered for one in pair if one)
     assert [*numbers] == [*RULES]

@@ -77,9 +77,9 @@ def test_meter_leds_reader_and_network() -> None:
         assert scene.connector(1).energy == 0
         await services.set_leds(PortLeds(red=LED_ON), PortLeds())
         assert await services.card_reader(ReaderTarget.READER, 2, b"id")
-        with pytest.raises(EwsRefusedError) as told:
+        with pytest.raises(EwsRefusedError) as raised:
             await services.card_reader(ReaderTarget.CARD, 2, b"")
-        assert told.value.reason is Refusal.CARD_READER_COMMAND
+        assert raised.value.reason is Refusal.CARD_READER_COMMAND
         with pytest.raises(RefusedOrderError):
             await services.card_reader(ReaderTarget.READER, 60, b"id")
         assert (await services.read_dhcp()).lease == 0
@@ -89,14 +89,14 @@ def test_meter_leds_reader_and_network() -> None:
 
 def test_leds_are_refused_by_a_box_that_has_them_itself() -> None:
     async def acts(scene: EwsScene) -> None:
-        with pytest.raises(EwsRefusedError) as told:
+        with pytest.raises(EwsRefusedError) as raised:
             await scene.charger().services.set_leds(PortLeds(), PortLeds(red=LED_ON))
-        assert told.value.reason is Refusal.LEDS
+        assert raised.value.reason is Refusal.LEDS
 
     play(EwsScene(), acts)
 
 
-def test_a_lost_answer_to_what_cannot_be_read_back_is_told() -> None:
+def test_a_lost_answer_raises_where_nothing_can_be_read_back() -> None:
     async def acts(scene: EwsScene) -> None:
         scene.line.mute = lambda name: name in ("cr", "ma")
         with pytest.raises(NotConfirmedError):
@@ -108,7 +108,7 @@ def test_a_lost_answer_to_what_cannot_be_read_back_is_told() -> None:
     play(EwsScene(), acts)
 
 
-def test_the_clock_on_the_users_word() -> None:
+def test_the_clock_is_set_by_the_user() -> None:
     async def acts(scene: EwsScene) -> None:
         scene.charger().box.clock = lambda: datetime(2026, 1, 2, 3, 4, tzinfo=UTC)
         await scene.charger().services.set_clock(ZoneInfo("Europe/Berlin"))
@@ -128,15 +128,15 @@ def test_one_parameter_is_changed_and_nothing_else(*, lost: bool) -> None:
         before = scene.box.system.pack("no")
         if lost:
             scene.line.mute = lambda name: name == "sp"
-        told = await scene.charger().services.change_parameters(
+        found = await scene.charger().services.change_parameters(
             SYSTEM_BLOCK, {"maximum_current": 20}
         )
-        assert told.maximum_current == 20
+        assert found.maximum_current == 20
         after = scene.box.system.pack("no")
         changed = [at for at in range(len(before)) if before[at] != after[at]]
         assert len(changed) == 1
         assert scene.box.system.max_current == 20
-        # What is installed counts at once.
+        # The new installation counts at once.
         await scene.until(lambda: scene.charger().limits.ceiling == 20)
 
     play(EwsScene(), acts)
@@ -153,9 +153,9 @@ def test_all_blocks_are_read_and_changed() -> None:
         await services.change_parameters(
             USER_BLOCK, {"zone_code": 1, "user_password": "anders"}
         )
-        told = await services.read_parameters(USER_BLOCK)
-        assert told.zone_code == 1
-        assert "anders" not in repr(told)
+        found = await services.read_parameters(USER_BLOCK)
+        assert found.zone_code == 1
+        assert "anders" not in repr(found)
 
     play(EwsScene(), acts)
 
@@ -184,17 +184,17 @@ def test_system_parameters_are_refused_while_a_car_charges() -> None:
         scene.box.system.admin_password = b"geheim".ljust(12, b"\0")
         scene.box.system.card_pin = b"4711"
         await scene.charge()
-        with pytest.raises(EwsRefusedError) as told:
+        with pytest.raises(EwsRefusedError) as raised:
             await scene.charger().services.change_parameters(
                 SYSTEM_BLOCK, {"maximum_current": 20}
             )
-        assert told.value.reason is Refusal.SYSTEM_PARAMETERS
+        assert raised.value.reason is Refusal.SYSTEM_PARAMETERS
         assert scene.status() == 0x40
 
     play(EwsScene(), acts)
 
 
-def test_what_the_box_keeps_as_it_was_is_told() -> None:
+def test_a_field_that_the_box_keeps_raises() -> None:
     """Over the network it takes the rest, and not the server mode."""
 
     async def acts(scene: EwsScene) -> None:
@@ -212,42 +212,44 @@ def test_what_the_box_keeps_as_it_was_is_told() -> None:
     play(EwsScene(), acts)
 
 
-def test_one_bit_is_changed_in_what_stands_there() -> None:
+def test_one_bit_is_changed_in_the_field_as_read() -> None:
     async def acts(scene: EwsScene) -> None:
         scene.box.system.admin_password = b"geheim".ljust(12, b"\0")
         scene.box.system.card_pin = b"4711"
-        seen: list[SystemMode] = []
+        modes: list[SystemMode] = []
 
-        def exclusive(told: SystemParameters) -> dict[str, object]:
+        def exclusive(read: SystemParameters) -> dict[str, object]:
             # Somebody else has changed a bit since we read it last.
-            seen.append(told.mode)
-            return {"mode": SystemMode(told.mode.value | SystemMode.EXCLUSIVE.value)}
+            modes.append(read.mode)
+            return {"mode": SystemMode(read.mode.value | SystemMode.EXCLUSIVE.value)}
 
         before = scene.box.system.mode
         scene.box.system.mode ^= SystemMode.CARDS.value
-        told = await scene.charger().services.change_parameters(SYSTEM_BLOCK, exclusive)
-        assert seen == [SystemMode(before ^ SystemMode.CARDS.value)]
-        assert told.mode == seen[0] | SystemMode.EXCLUSIVE
-        assert scene.box.system.mode == told.mode.value
+        found = await scene.charger().services.change_parameters(
+            SYSTEM_BLOCK, exclusive
+        )
+        assert modes == [SystemMode(before ^ SystemMode.CARDS.value)]
+        assert found.mode == modes[0] | SystemMode.EXCLUSIVE
+        assert scene.box.system.mode == found.mode.value
         assert [one.name for one in scene.line.named("rp", "sp")][-3:-1] == ["rp", "sp"]
 
     play(EwsScene(), acts)
 
 
-def test_bits_that_nobody_knows_do_not_hold_up_a_change() -> None:
+def test_unknown_bits_do_not_prevent_a_change() -> None:
     async def acts(scene: EwsScene) -> None:
         scene.box.system.admin_password = b"geheim".ljust(12, b"\0")
         scene.box.system.card_pin = b"4711"
-        # The virtual box refuses what its manual does not know; a later one may not.
+        # The virtual box refuses bits that are not in its manual; a later one may not.
         scene.box.system.mode |= 0x80
         with patch.object(scene.box.system, "write", partial(take, scene.box.system)):
-            told = await scene.charger().services.change_parameters(
+            found = await scene.charger().services.change_parameters(
                 SYSTEM_BLOCK,
-                lambda told: {
-                    "mode": SystemMode(told.mode.value | SystemMode.EXCLUSIVE.value)
+                lambda read: {
+                    "mode": SystemMode(read.mode.value | SystemMode.EXCLUSIVE.value)
                 },
             )
-        assert told.mode.value & 0x90 == 0x90
+        assert found.mode.value & 0x90 == 0x90
         assert scene.box.system.mode & 0x90 == 0x90
 
     def take(system: VirtualParameters, block: bytes, *, network: bool) -> int:
@@ -260,21 +262,21 @@ def test_bits_that_nobody_knows_do_not_hold_up_a_change() -> None:
 
 def test_all_hidden_secrets_are_named() -> None:
     async def acts(scene: EwsScene) -> None:
-        with pytest.raises(HiddenSecretError) as told:
+        with pytest.raises(HiddenSecretError) as raised:
             await scene.charger().services.change_parameters(
                 SYSTEM_BLOCK, {"maximum_current": 20}
             )
-        assert told.value.names == ("admin_password", "card_pin")
+        assert raised.value.names == ("admin_password", "card_pin")
 
     play(EwsScene(options={"masking": "stars"}), acts)
 
 
 @pytest.mark.parametrize("masking", ["no", "stars"])
 @pytest.mark.parametrize("lost", ["nothing", "answer", "command"])
-def test_a_password_that_may_not_have_been_taken_is_told(
+def test_a_password_that_may_not_have_been_written_raises(
     masking: str, lost: str
 ) -> None:
-    """Where the box tells it, it is read back; else only the answer says so."""
+    """Where the box does not hide it, it is read back; else only the answer counts."""
 
     async def acts(scene: EwsScene) -> None:
         scene.box.user.user_password = b"geheim".ljust(12, b"\0")
@@ -297,10 +299,10 @@ def test_a_password_that_may_not_have_been_taken_is_told(
 
 def test_a_text_with_spaces_around_it_is_known_again() -> None:
     async def acts(scene: EwsScene) -> None:
-        told = await scene.charger().services.change_parameters(
+        found = await scene.charger().services.change_parameters(
             INSTALLATION_BLOCK, {"name": " Max "}
         )
-        assert told.name == "Max"
+        assert found.name == "Max"
 
     play(EwsScene(), acts)
 

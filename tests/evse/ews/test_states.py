@@ -1,4 +1,4 @@
-"""What the status byte says, and what may be ordered in it."""
+"""The status byte, and the orders for each state."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ from .wire import BOX, PORTS
 
 IDLE = decode_ports(PORTS)[1]
 
-# Status byte: OCPP word, plugged, charging (contactor open), fault. 3.2.4, rc.
+# Status byte: OCPP status, plugged, charging (contactor open), fault. 3.2.4, rc.
 MANUAL: dict[int, tuple[Status, bool | None, bool | None, Fault | None]] = {
     0x00: (Status.AVAILABLE, False, False, None),
     0x10: (Status.PREPARING, None, False, None),
@@ -54,7 +54,7 @@ def port(code: int, **changes: object) -> PortStatus:
 
 
 @pytest.mark.parametrize("code", MANUAL)
-def test_what_the_status_byte_says(code: int) -> None:
+def test_the_status_byte(code: int) -> None:
     status, plugged, charging, fault = MANUAL[code]
     state = port_state(port(code))
     assert (state.status, state.plugged, state.charging) == (status, plugged, charging)
@@ -95,7 +95,7 @@ def test_our_own_pause(code: int) -> None:
         assert paused is MANUAL[code][0]
 
 
-def test_where_the_state_does_not_say_so_the_contactor_does() -> None:
+def test_the_contactor_shows_charging_where_the_state_does_not() -> None:
     assert port_state(port(0xA4, contactor=True)).charging is None
     assert port_state(port(0x11, contactor=True)).charging is None
     assert port_state(port(0x11)).charging is False
@@ -160,7 +160,7 @@ def test_the_orders_are_the_manuals() -> None:
 
 
 @given(st.sampled_from(StartStop), st.integers(0, 255), st.booleans())
-def test_what_may_be_ordered_in_which_state(
+def test_orders_and_their_states(
     order: StartStop,
     code: int,
     paused: bool,  # noqa: FBT001
@@ -183,7 +183,7 @@ def test_a_pause_never_unlocks() -> None:
 
 
 @pytest.mark.parametrize("code", [0x00, 0x10])
-def test_nobody_is_started_who_is_not_there(code: int) -> None:
+def test_nothing_is_started_without_a_car(code: int) -> None:
     for paused in (True, False):
         assert not is_allowed(StartStop.START, code, paused=paused)
     assert not is_allowed(StartStop.REQUEST_START, code)

@@ -1,4 +1,4 @@
-"""What a box tells, byte by byte."""
+"""Records of a box, byte by byte."""
 
 from datetime import datetime
 from ipaddress import IPv4Address
@@ -131,7 +131,7 @@ def test_a_port_in_mode_1_does_not_know_all_of_it() -> None:
         decode_ports(wild + PORT_CHARGING, (False, True))
 
 
-def test_a_port_that_is_not_there_is_not_looked_at() -> None:
+def test_bytes_of_a_missing_port_are_ignored() -> None:
     for second in (54 * b"\xff", PORT_IDLE):
         assert decode_ports(PORT_CHARGING + second, count=1) == (CHARGING,)
     with pytest.raises(ImplausibleReplyError):
@@ -245,7 +245,7 @@ def test_rs_that_cannot_be(at: int, value: int) -> None:
         decode_box(changed(BOX, at, value))
 
 
-def test_a_maximum_that_is_not_told_yet() -> None:
+def test_a_maximum_that_is_not_known_yet() -> None:
     assert decode_box(changed(BOX, 62, 0)).maximum_current == 0
 
 
@@ -267,7 +267,7 @@ def test_rg() -> None:
 # -- Private -------------------------------------------------------------------------
 
 
-def test_no_repr_tells_names_cards_or_addresses() -> None:
+def test_no_repr_has_names_cards_or_addresses() -> None:
     text = repr((decode_ports(PORTS), READ, decode_box(BOX), decode_dhcp(DHCP), MAX))
     for private in ("Max", "42,", "192.168", "255.255", "x04", "xa3"):
         assert private not in text.replace("meter_cycles=42,", "")

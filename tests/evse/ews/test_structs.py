@@ -1,4 +1,4 @@
-"""Every struct there and back, its length, and what no field takes."""
+"""Every struct encoded and decoded, its length, and values that no field takes."""
 
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
@@ -181,7 +181,7 @@ CANNOT_BE_WRITTEN: list[tuple[Field[Any], list[object]]] = [
     [(field, value) for field, values in CANNOT_BE_WRITTEN for value in values],
     ids=lambda value: type(value).__name__ if isinstance(value, Field) else repr(value),
 )
-def test_what_cannot_be_written(field: Field[Any], value: object) -> None:
+def test_values_that_cannot_be_written(field: Field[Any], value: object) -> None:
     with pytest.raises(RefusedOrderError):
         field.encode(value)
 
@@ -205,7 +205,7 @@ def test_what_cannot_be_written(field: Field[Any], value: object) -> None:
     ],
     ids=lambda value: value if isinstance(value, str) else type(value).__name__,
 )
-def test_what_cannot_be_read(field: Field[Any], wire: str) -> None:
+def test_bytes_that_cannot_be_read(field: Field[Any], wire: str) -> None:
     with pytest.raises(ImplausibleReplyError, match=f"^{field.name} cannot be"):
         field.decode(bytes.fromhex(wire))
 
@@ -229,13 +229,13 @@ def test_what_cannot_be_read(field: Field[Any], wire: str) -> None:
         (Unused(name="x", width=2).decode, "ffff", None),
     ],
 )
-def test_what_is_read(
+def test_values_that_are_read(
     read: Callable[[bytes], object], wire: str, value: object
 ) -> None:
     assert read(bytes.fromhex(wire)) == value
 
 
-def test_no_error_tells_a_text() -> None:
+def test_no_error_has_a_text_in_it() -> None:
     for field, wish in (
         (Text(name="password", width=4), "secret"),
         (Text(name="password", width=12), "secret\0"),

@@ -1,4 +1,4 @@
-"""When a box is asked, and what its silence means."""
+"""When a box is polled, and the effect of silence."""
 
 import asyncio
 from dataclasses import replace
@@ -40,8 +40,8 @@ def test_the_box_never_waits_for_30_seconds(interval: float) -> None:
     play(EwsScene(timing=TCP_TIMING, config={"poll_interval": interval}), acts)
 
 
-def test_a_slow_first_port_holds_up_nobody() -> None:
-    """The box's deadline is the first port's, and moves with what the other says."""
+def test_a_slow_first_port_does_not_delay_the_other() -> None:
+    """The first port has the deadline, which moves with commands to the other."""
 
     async def acts(scene: EwsScene) -> None:
         port = scene.charger()

@@ -1,7 +1,7 @@
-"""Two ports, and all that can happen to them at once: what must never happen does not.
+"""Two ports, and any events at both of them: the safety rules hold.
 
-The box is the witness. Beside what `test_orders_fuzz` does to one port: the set-up is
-changed, orders run out, the box and we are restarted, locks are locked and unlocked.
+The box is the oracle. Beside the events of `test_orders_fuzz`: the configuration
+changes, orders expire, the box and the library restart, plugs are locked and unlocked.
 """
 
 import asyncio
@@ -19,6 +19,8 @@ JUMPER = 32
 START, WAITING = 3, 0x30
 PORTS = st.sampled_from((1, 2))
 WAITS = st.sampled_from((0.0, 0.05, 0.3, 1.0, 3.0, 8.0, 35.0))
+GONE = st.sampled_from((0.0, 1.0, 5.0))
+"""Time for which the line is gone, s."""
 ACTS = st.one_of(
     st.tuples(st.just("off"), st.none()),
     st.tuples(st.just("limit"), st.sampled_from((0.0, 6.0, 10.0, 16.0, 32.0, 80.0))),
@@ -31,7 +33,7 @@ ACTS = st.one_of(
     st.tuples(st.just("lock"), st.none()),
     st.tuples(st.just("lose"), st.sampled_from(("rc", "rd", "rs", "sl", "st", "rp"))),
     st.tuples(st.just("deaf"), st.sampled_from(("rc", "sl", "st", "sc"))),
-    st.tuples(st.just("line"), st.none()),
+    st.tuples(st.just("line"), GONE),
     st.tuples(st.just("anew"), st.none()),
     st.tuples(st.just("cycle"), st.none()),
     st.tuples(st.just("reset"), st.none()),
@@ -56,15 +58,15 @@ class Run:
     deaf: list[str] = field(default_factory=list)
     tasks: list[asyncio.Task[None]] = field(default_factory=list)
     wrong: list[str] = field(default_factory=list)
-    words: dict[int, bool] = field(default_factory=dict)
-    """The last word of the user about each port."""
+    allowed: dict[int, bool] = field(default_factory=dict)
+    """The last permission given by the user to each port."""
     _sent: int = 0
 
     def __post_init__(self) -> None:
         self.scene.line.mute = lambda name: self._take(self.lost, name)
         self.scene.line.deaf = lambda name: self._take(self.deaf, name)
         self._sent = len(self.scene.line.sent)
-        self.scene.seen.append(self._watch)
+        self.scene.watchers.append(self._watch)
 
     @staticmethod
     def _take(names: list[str], name: str) -> bool:
@@ -74,7 +76,7 @@ class Run:
         return True
 
     def _watch(self) -> None:
-        """See that nothing is said that may not be at that time."""
+        """Check each order sent since, for the time at which it was sent."""
         sent = self.scene.line.sent
         for one in sent[self._sent :]:
             if one.name == "st":
@@ -89,33 +91,33 @@ class Run:
             self.wrong.append(f"port {port}: {current} A, not 6 to {most} A")
 
     def judge_start(self, port: int) -> None:
-        word = self.words.get(port)
-        if word is False:
+        allowed = self.allowed.get(port)
+        if allowed is False:
             self.wrong.append(f"port {port} is started, and must not charge")
-        elif word is None and self.scene.status(port) == WAITING:
-            self.wrong.append(f"port {port}: nobody has let this car charge")
+        elif allowed is None and self.scene.status(port) == WAITING:
+            self.wrong.append(f"port {port}: this car has no permission")
 
     def go(
-        self, port: int, what: OrderChange | Command, *, value: object = None
+        self, port: int, act: OrderChange | Command, *, value: object = None
     ) -> None:
         async def say() -> None:
             charger = self.scene.charger(port)
             with suppress(EvseError):
-                if isinstance(what, OrderChange):
-                    await charger.change_orders(what)
+                if isinstance(act, OrderChange):
+                    await charger.change_orders(act)
                 else:
-                    await charger.command(what, value)  # type: ignore[arg-type]
+                    await charger.command(act, value)  # type: ignore[arg-type]
 
         self.tasks.append(asyncio.ensure_future(say()))
 
-    def act(self, what: str, value: object, port: int) -> None:  # noqa: C901, PLR0912 - a table
+    def act(self, act: str, value: object, port: int) -> None:  # noqa: C901, PLR0912 - a table
         scene = self.scene
         charger, car = scene.charger(port), scene.cars[port - 1]
-        match what, value:
+        match act, value:
             case (("on" | "off"), _):
                 self._watch()
-                self.words[port] = what == "on"
-                self.go(port, OrderChange(allowed=what == "on"))
+                self.allowed[port] = act == "on"
+                self.go(port, OrderChange(allowed=act == "on"))
             case "limit", float():
                 self.go(port, OrderChange(current=value))
             case "fail_safe", float():
@@ -134,22 +136,22 @@ class Run:
             case "optimise", bool():
                 self.go(port, Command.SET_OPTIMISED, value=value)
             case (("lock" | "unlock" | "reset"), _):
-                self.go(port, Command[what.upper()])
+                self.go(port, Command[act.upper()])
             case (("lose" | "deaf"), str()):
-                (self.lost if what == "lose" else self.deaf).append(value)
-            case "line", _:
-                scene.line.unplug()
+                (self.lost if act == "lose" else self.deaf).append(value)
+            case "line", float():
+                scene.unplug(value)
             case "anew", _:
                 self.tasks.append(asyncio.ensure_future(self._anew(port)))
             case "cycle", _:
                 scene.box.power_cycle(2.0)
 
     async def _anew(self, port: int) -> None:
-        """Let us forget all but the orders and the set-up."""
+        """Restart the library: orders and configuration are all it knows."""
         scene = self.scene
         old = scene.charger(port)
         new = type(old)(old.config, old.orders)
-        # In one breath: without its charger nothing is said for a port.
+        # Without an await: a port without its charger would get no orders.
         scene.bus._drop_jobs(old, begun=True)
         scene.bus.add(new)
         old.bus = None
@@ -171,15 +173,15 @@ def judged(acts: list[Act], *, pause_status: int, flag: str, begin: str) -> EwsS
         begun = [len(scene.starts(port)) for port in (1, 2)]
         run = Run(scene)
         if begin == "off":
-            run.words = {1: False, 2: False}
-        for (what, value), port, wait in acts:
-            run.act(what, value, port)
+            run.allowed = {1: False, 2: False}
+        for (act, value), port, wait in acts:
+            run.act(act, value, port)
             await asyncio.sleep(wait)
         run.lost.clear()
         run.deaf.clear()
         await asyncio.sleep(90)
         assert not run.wrong
-        names = [what for (what, _), *_ in acts]
+        names = [act for (act, _), *_ in acts]
         for number, port in enumerate(scene.box.ports, start=1):
             assert not port.history.unlocked_under_power
             unlocked = [one for one in scene.unlocked(number) if one == "sl 6"]
@@ -205,7 +207,7 @@ FLAGS = st.sampled_from(("read", "clock", "never"))
 
 @settings(max_examples=40)
 @given(acts=acts_of(ON), pause_status=PAUSES, flag=FLAGS, begin=BEGINS)
-def test_nothing_is_unlocked_unasked(
+def test_nothing_is_unlocked_without_an_order(
     acts: list[Act], pause_status: int, flag: str, begin: str
 ) -> None:
     judged(acts, pause_status=pause_status, flag=flag, begin=begin)
@@ -213,7 +215,7 @@ def test_nothing_is_unlocked_unasked(
 
 @settings(max_examples=40)
 @given(acts=acts_of(UNLOCK), pause_status=PAUSES, flag=FLAGS)
-def test_nothing_is_started_unasked(
+def test_nothing_is_started_without_an_order(
     acts: list[Act], pause_status: int, flag: str
 ) -> None:
     judged(acts, pause_status=pause_status, flag=flag, begin="free")

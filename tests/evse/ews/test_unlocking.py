@@ -62,23 +62,23 @@ def freeze(scene: EwsScene, status: int) -> None:
     port.status = status
 
 
-# -- What is said --------------------------------------------------------------------
+# -- The order sent ------------------------------------------------------------------
 
 
 def test_order_6_unlocks_in_two_states_only() -> None:
     known = decode_ports(PORTS)[0]
     allowed = {(0x50, 0), (0x50, 1), (0x50, 2), (0x30, 0), (0x30, 1)}
     for status, start, locked in product(range(0x100), range(3), (True, False, None)):
-        seen = replace(known, state=status, start_code=start, locked=locked)
+        status_of_port = replace(known, state=status, start_code=start, locked=locked)
         if locked and (status, start) in allowed:
-            assert unlock(2, seen).parameters == b"\x02\x06"
+            assert unlock(2, status_of_port).parameters == b"\x02\x06"
         else:
             with pytest.raises(NotAvailableError, match="not in state"):
-                unlock(2, seen)
+                unlock(2, status_of_port)
 
 
 @pytest.mark.parametrize("status", sorted(STATES))
-def test_what_is_said_in_each_state(status: int) -> None:
+def test_the_order_sent_in_each_state(status: int) -> None:
     async def acts(scene: EwsScene) -> None:
         freeze(scene, status)
         await scene.until(lambda: scene.connector().raw_state == f"0x{status:02X}")
@@ -88,16 +88,16 @@ def test_what_is_said_in_each_state(status: int) -> None:
             assert not scene.line.orders()
             return
         await scene.charger().command(Command.UNLOCK)
-        (said,) = scene.line.orders()
+        (sent,) = scene.line.orders()
         order = SIX if status in (0x30, 0x50) else STOP
-        assert tuple(said.parameters) == (1, order)
+        assert tuple(sent.parameters) == (1, order)
         assert scene.unlocked() == [f"sl {order}"]
         assert not scene.connector().locked
 
     play(EwsScene(), acts)
 
 
-def test_a_plug_that_is_free_needs_no_word() -> None:
+def test_nothing_is_sent_for_a_free_plug() -> None:
     async def acts(scene: EwsScene) -> None:
         await scene.charger().command(Command.UNLOCK)
         await scene.plug()
@@ -114,7 +114,7 @@ def test_a_plug_that_is_free_needs_no_word() -> None:
 
 
 def test_a_car_that_waits() -> None:
-    """It still waits; nobody has started or stopped anything."""
+    """It still waits; nothing was started or stopped."""
 
     async def acts(scene: EwsScene) -> None:
         await lock(scene)
@@ -191,9 +191,9 @@ def test_without_a_lock_there_is_nothing_to_unlock(options: dict[str, Any]) -> N
 # -- What goes wrong -----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("heard", [True, False])
+@pytest.mark.parametrize("received", [True, False])
 @pytest.mark.parametrize("begin", [lock, pause])
-def test_a_lost_answer(begin: Any, *, heard: bool) -> None:  # noqa: ANN401
+def test_a_lost_answer(begin: Any, *, received: bool) -> None:  # noqa: ANN401
     async def acts(scene: EwsScene) -> None:
         await begin(scene)
         since = now()
@@ -202,13 +202,13 @@ def test_a_lost_answer(begin: Any, *, heard: bool) -> None:  # noqa: ANN401
         def lose(name: str) -> bool:
             return name == "sl" and bool(lost) and bool(lost.pop())
 
-        if heard:
+        if received:
             scene.line.mute = lose
         else:
             scene.line.deaf = lose
         await scene.charger().command(Command.UNLOCK)
-        said = scene.line.orders(since=since)
-        assert [one.parameters[1] for one in said] == [SIX] * (1 if heard else 2)
+        sent = scene.line.orders(since=since)
+        assert [one.parameters[1] for one in sent] == [SIX] * (1 if received else 2)
         assert scene.unlocked() == ["sl 6"]
         names = [one.name for one in scene.line.sent if one.when >= since]
         for at, name in enumerate(names):
@@ -256,18 +256,18 @@ def test_a_record_inside_the_conversation(name: str, at: int) -> None:
     play(EwsScene(ports=(1,)), acts)
 
 
-def test_a_charge_that_begins_between_look_and_order_is_not_paused() -> None:
-    """A record says that something happens: then it is looked at again."""
+def test_a_charge_that_begins_between_status_and_order_is_not_paused() -> None:
+    """A record outdates the status, which is then read again."""
 
     async def acts(scene: EwsScene) -> None:
         await lock(scene)
         box = scene.charger().box
-        original, told = box.send_command, []
+        original, sent_before = box.send_command, []
 
         async def send(turn: Any, command: Any, make: Any) -> None:  # noqa: ANN401
-            if not told:
-                told.append(command)
-                scene.box.ports[0].release_start("somebody")
+            if not sent_before:
+                sent_before.append(command)
+                scene.box.ports[0].release_start("page")
                 scene.box.step()
                 assert scene.status() == 0x40
                 box.on_info(Info(changes=Change.PORT_1, keys=(0,) * 8))
@@ -282,7 +282,7 @@ def test_a_charge_that_begins_between_look_and_order_is_not_paused() -> None:
     play(EwsScene(), acts)
 
 
-def test_records_without_end_are_not_waited_for() -> None:
+def test_records_without_end_do_not_block_an_order() -> None:
     async def acts(scene: EwsScene) -> None:
         await lock(scene)
         box = scene.charger().box
@@ -302,8 +302,8 @@ def test_records_without_end_are_not_waited_for() -> None:
     play(EwsScene(), acts)
 
 
-def test_a_charge_that_begins_without_a_word_ends_unlocked() -> None:
-    """No record came in time: order 6 has paused, and the next look tells."""
+def test_a_charge_that_begins_without_a_record_ends_unlocked() -> None:
+    """No record came in time: order 6 has paused, which the next status shows."""
 
     async def acts(scene: EwsScene) -> None:
         await lock(scene)
@@ -311,7 +311,7 @@ def test_a_charge_that_begins_without_a_word_ends_unlocked() -> None:
 
         def write(data: bytes, *, reply_may_equal: bool = False) -> float:
             if data[4:6] == b"sl" and not scene.starts():
-                scene.box.ports[0].release_start("somebody")
+                scene.box.ports[0].release_start("page")
                 scene.box.ports[0].step(now())
             return original(data, reply_may_equal=reply_may_equal)
 
@@ -328,7 +328,7 @@ def test_a_charge_that_begins_without_a_word_ends_unlocked() -> None:
     play(EwsScene(), acts)
 
 
-def test_a_plug_that_stays_locked_is_told() -> None:
+def test_a_plug_that_stays_locked_raises() -> None:
     async def acts(scene: EwsScene) -> None:
         await pause(scene)
         port = scene.box.ports[0]
@@ -362,15 +362,15 @@ def test_a_lock_that_jams() -> None:
 
 
 @pytest.mark.parametrize("code", [*range(1, 14), 255])
-def test_a_refusal_says_why(code: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refusal_has_its_reason(code: int, monkeypatch: pytest.MonkeyPatch) -> None:
     async def acts(scene: EwsScene) -> None:
         await pause(scene)
         monkeypatch.setattr(ews_commands, "execute", lambda *_: code)
         since = now()
-        with pytest.raises(EwsRefusedError) as told:
+        with pytest.raises(EwsRefusedError) as raised:
             await scene.charger().command(Command.UNLOCK)
-        assert told.value.reason is START_STOP_CODES.get(code, Refusal.UNKNOWN)
-        assert told.value.code == code
+        assert raised.value.reason is START_STOP_CODES.get(code, Refusal.UNKNOWN)
+        assert raised.value.code == code
         assert len(scene.line.orders(since=since)) == 1
         assert scene.charger().permission.pause_state is Pause.OURS
 

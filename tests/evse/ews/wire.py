@@ -1,4 +1,4 @@
-"""Messages built from the manual's words, with nothing of the library."""
+"""Messages built from the tables of the manual, without the library."""
 
 INFO = bytes.fromhex("02 000b 49 6966 05 ff000001 000000fe 48")
 """Port 1 and a card changed; key 1 of port 1 pressed, key 4 released after 0.1 s; key

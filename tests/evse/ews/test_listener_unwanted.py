@@ -1,4 +1,4 @@
-"""Who dials us and is not wanted: little time, few bytes, no trust."""
+"""Unwanted connections: little time, few bytes, no trust."""
 
 import asyncio
 from ipaddress import ip_network
@@ -25,7 +25,7 @@ from .dialling import (
     has_reading,
     run,
     server,
-    stranger,
+    silent_client,
     until,
 )
 
@@ -37,7 +37,7 @@ RECORD = bytes.fromhex("02 000b 49 6966 00 0000000000000000 4d")
 def test_addresses_that_may_not_connect() -> None:
     async def scene() -> None:
         async with server(allowed=(ip_network("192.0.2.0/24"),)) as made:
-            with stranger(made) as client:
+            with silent_client(made) as client:
                 assert await goes(client)
             assert made.statistics.not_allowed == 1
         for allowed in ("127.0.0.0/8", "::ffff:127.0.0.0/104", "::ffff:127.0.0.1"):
@@ -51,12 +51,12 @@ def test_addresses_that_may_not_connect() -> None:
     run(scene)
 
 
-def test_silence_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_silent_connection_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(listening, "IDENTIFY_TIME", 0.5)
 
     async def scene() -> None:
         async with server() as made:
-            with stranger(made) as client:
+            with silent_client(made) as client:
                 assert await goes(client)
             assert made.statistics.unidentified == 1
 
@@ -77,7 +77,7 @@ def test_silence_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_garbage_ends_a_connection(data: bytes) -> None:
     async def scene() -> None:
         async with server() as made:
-            with stranger(made) as client:
+            with silent_client(made) as client:
                 await asyncio.get_running_loop().sock_sendall(client, data)
                 assert await goes(client, 1.5)
 
@@ -94,15 +94,15 @@ def test_garbage_ends_a_connection(data: bytes) -> None:
     ],
     ids=["nested", "nested deeply", "broken", "beginnings"],
 )
-def test_much_garbage_at_once_holds_up_nobody(data: bytes) -> None:
+def test_much_garbage_at_once_does_not_block_the_loop(data: bytes) -> None:
     async def scene() -> None:
         loop = asyncio.get_running_loop()
         async with server() as made:
             [listening_at] = made._server.sockets  # type: ignore[union-attr]
             listening_at.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
-            with stranger(made) as client:
+            with silent_client(made) as client:
                 client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
-                # All of it is there before anybody looks.
+                # All of it is there before the first byte is processed.
                 client.send(data * ((1 << 18) // len(data)))
                 begun, longest = loop.time(), 0.0
                 gone = asyncio.create_task(goes(client))
@@ -116,7 +116,7 @@ def test_much_garbage_at_once_holds_up_nobody(data: bytes) -> None:
     run(scene)
 
 
-def test_who_sends_slowly_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_connection_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(listening, "IDENTIFY_TIME", 0.5)
 
     async def scene() -> None:
@@ -130,7 +130,7 @@ def test_who_sends_slowly_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> 
     run(scene)
 
 
-def test_who_says_nothing_does_not_keep_boxes_out(
+def test_silent_connections_do_not_keep_boxes_out(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(listening, "GRACE", 0.1)
@@ -143,7 +143,7 @@ def test_who_says_nothing_does_not_keep_boxes_out(
             with dialling(made):
                 await until(lambda: has_reading(bus))
             assert made.statistics.crowded_out > 0
-            # One more for the box that is set up.
+            # One more for the registered box.
             assert len(made._unidentified) <= listening.MOST_UNIDENTIFIED + 1
             for one in silent:
                 one.close()
@@ -151,10 +151,10 @@ def test_who_says_nothing_does_not_keep_boxes_out(
     run(scene)
 
 
-def test_who_comes_and_goes_does_not_fill_the_log(
+def test_many_connections_do_not_fill_the_log(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """With the number of a box that is away anybody is taken for it."""
+    """With the number of a box that is away, any device is taken for it."""
     monkeypatch.setattr(recovery, "PAUSES", (0.01,))
     monkeypatch.setattr(listening, "PROOF_PAUSE", 0.0)
     cycles = LOSSES + 10
@@ -166,28 +166,30 @@ def test_who_comes_and_goes_does_not_fill_the_log(
                 with dialling(made):
                     for cycle in range(1, cycles + 1):
                         await until(lambda: bus.connected)
-                        seconds = made.statistics.duplicates
-                        await until(lambda n=seconds: made.statistics.duplicates > n)
+                        dropped = made.statistics.duplicates
+                        await until(lambda n=dropped: made.statistics.duplicates > n)
                         bus.line.end("it goes")
                         await until(lambda n=cycle: bus.line.statistics.lost >= n)
             assert first_one.attempts
 
     run(scene)
-    told = [one.getMessage() for one in caplog.records if one.levelname == "WARNING"]
-    for words in ("was lost", "connected again", "connected and answers"):
-        assert 0 < sum(words in one for one in told) <= LOSSES
+    warnings = [
+        one.getMessage() for one in caplog.records if one.levelname == "WARNING"
+    ]
+    for text in ("was lost", "connected again", "connected and answers"):
+        assert 0 < sum(text in one for one in warnings) <= LOSSES
 
 
-def test_keys_that_nobody_can_press_are_not_told() -> None:
+def test_a_flood_of_key_events_is_limited() -> None:
     """Each would be an event: a flood of them would keep Home Assistant busy."""
     record = bytes.fromhex("02 000b 49 6966 00 ffffffffffffffff 4d")
-    told: list[object] = []
+    events: list[object] = []
 
     async def scene() -> None:
         async with server() as made, expected(made) as bus:
             with dialling(made):
                 await until(lambda: has_reading(bus))
-                first(bus).subscribe_events(told.append)
+                first(bus).subscribe_events(events.append)
                 line, wire = bus.line, bus.wire.statistics
                 assert isinstance(line, AcceptedLine)
                 begun = now()
@@ -197,12 +199,12 @@ def test_keys_that_nobody_can_press_are_not_told() -> None:
                     assert line.is_open
                     await until(lambda n=replies: wire.replies > n)
                 windows = now() - begun + 1
-            assert KEYS <= len(told) <= MOST_KEYS * windows
+            assert KEYS <= len(events) <= MOST_KEYS * windows
 
     run(scene)
 
 
-def test_a_box_is_not_asked_all_the_time_whether_it_is_there() -> None:
+def test_a_box_is_rarely_polled_for_other_connections() -> None:
     box = VirtualBox(serial=SERIAL)
 
     async def scene() -> None:
@@ -215,7 +217,7 @@ def test_a_box_is_not_asked_all_the_time_whether_it_is_there() -> None:
                     await asyncio.sleep(2.0)
                     assert made.statistics.duplicates > refused
                     asked = [one.name for one in box.commands[before:]]
-            # Polls come every 0.5 s, and one a second to find out.
+            # A poll every 0.5 s, and one a second for the other connection.
             assert asked.count("rc") <= 8
             assert made.statistics.replaced == 0
 

@@ -50,7 +50,7 @@ def test_a_record_at_every_position_of_an_answer(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["rc", "rd"])
 def test_a_record_that_has_begun_when_the_next_command_goes(name: str) -> None:
-    """A serial port gives its bytes in lumps, and what it is told is told once."""
+    """A serial port delivers bytes in lumps; each record counts once."""
     length = {"rc": 115, "rd": 63}[name]
 
     async def acts(scene: EwsScene) -> None:
@@ -60,7 +60,7 @@ def test_a_record_that_has_begun_when_the_next_command_goes(name: str) -> None:
             begun = InfoMix("after", cut=length + come, pause=0.02)
             scene.box.mix_info(*([InfoMix("none")] if name == "rd" else []), begun)
             scene.charger().poll_now()
-            # After rc comes rd; after that, what else waits.
+            # After rc comes rd, then any other turn.
             scene.charger(2).poll_now()
             await asyncio.sleep(0.6)
             assert scene.charger().box.info_count == infos + 1, come
@@ -91,7 +91,7 @@ def test_a_record_beside_the_answer_to_an_order(where: str, cut: int) -> None:
 @pytest.mark.parametrize("at", range(9))
 @pytest.mark.parametrize("name", ["sl", "rc"])
 def test_a_record_inside_the_conversation_of_a_pause(name: str, at: int) -> None:
-    """Inside the answer to order 6, and inside the look right before it."""
+    """Inside the answer to order 6, and to the rc right before it."""
 
     async def acts(scene: EwsScene) -> None:
         await scene.charge()
@@ -122,7 +122,7 @@ def test_a_record_is_followed_by_a_poll_at_once() -> None:
 
 
 @pytest.mark.parametrize("port", [1, 2])
-def test_a_record_is_heard_for_both_ports_while_commands_never_end(port: int) -> None:
+def test_a_record_counts_for_both_ports_while_commands_never_end(port: int) -> None:
     async def acts(scene: EwsScene) -> None:
         await scene.plug(port)
         asked = scene.charger(3 - port)
@@ -168,7 +168,7 @@ def test_keys_and_cards_are_events() -> None:
     play(EwsScene(options={"manual_io": True, "rfid": True}), acts)
 
 
-def test_a_flood_of_records_starves_nobody() -> None:
+def test_a_flood_of_records_does_not_block_commands() -> None:
     async def acts(scene: EwsScene) -> None:
         for _ in range(500):
             scene.box.send_raw(scene.box._record(4, {}))

@@ -1,4 +1,4 @@
-"""The virtual box packs its blocks by itself: another reading of the same manual."""
+"""The virtual box packs its records by itself, from the same manual."""
 
 from dataclasses import fields
 from datetime import datetime
@@ -57,8 +57,8 @@ address = word.map(IPv4Address)
 text = st.text("aZ09-äß", min_size=1, max_size=12)
 
 
-def values(told: Any) -> list[Any]:  # noqa: ANN401 - any of the blocks
-    return [getattr(told, field.name) for field in fields(told)]
+def values(record: Any) -> list[Any]:  # noqa: ANN401 - any of the blocks
+    return [getattr(record, field.name) for field in fields(record)]
 
 
 _port = st.tuples(
@@ -73,13 +73,13 @@ _port = st.tuples(
 def test_rc(one: tuple[Any, ...], two: tuple[Any, ...]) -> None:
     data = b"".join(ews_status.RC.pack(*port, bytes(13)) for port in (one, two))
 
-    def told(port: PortStatus) -> tuple[Any, ...]:
+    def raw(port: PortStatus) -> tuple[Any, ...]:
         known = values(port)
         assert known.pop() is None
         known[16:19] = [round(100 * voltage) for voltage in known[16:19]]
         return tuple(known)
 
-    assert tuple(told(port) for port in decode_ports(data)) == (one, two)
+    assert tuple(raw(port) for port in decode_ports(data)) == (one, two)
 
 
 @given(st.tuples(st.integers(1, 2), byte, word, byte, flag, byte, flag, byte))
@@ -138,7 +138,7 @@ def tell(box: EwsBox, request: Request) -> None:
     )
 
 
-def test_all_that_a_box_tells_is_understood() -> None:
+def test_all_records_of_a_box_are_decoded() -> None:
     box = box_at(100.0)
     system = SYSTEM_BLOCK.decode(ask(box, CommandId.READ_SYSTEM))
     assert system.mode_1 == (False, True)
@@ -153,7 +153,7 @@ def test_all_that_a_box_tells_is_understood() -> None:
     assert decode_dhcp(ask(box, CommandId.READ_DHCP)).lease == 3600
 
 
-def test_all_that_a_box_is_told_is_taken() -> None:
+def test_all_commands_to_a_box_are_accepted() -> None:
     box = box_at(100.0)
     tell(box, set_meter(1, 123456))
     tell(box, set_clock(datetime.fromisoformat("2026-01-02T03:04:05")))

@@ -1,4 +1,4 @@
-"""A pause that may be ours is not said again, and starts nobody whom it did not stop."""
+"""A pause that may be ours is not ordered again, and its end starts no other car."""
 
 import asyncio
 from contextlib import suppress
@@ -22,7 +22,7 @@ def amperes(current: float) -> OrderChange:
 
 
 async def begin_anew(scene: EwsScene, orders: Orders, **config: float | None) -> None:
-    """Let Home Assistant restart: it knows the orders and nothing else."""
+    """Restart the library: the stored orders are all it knows."""
     await scene.bus.remove(scene.charger())
     scene.bus.group = BoxPorts()
     charger = scene.make_charger(1)
@@ -42,7 +42,7 @@ def test_a_restart_flag_that_stays_does_not_end_our_pause(flag: str) -> None:
         await scene.charge()
         await scene.charger().change_orders(OFF)
         for _ in range(2):
-            scene.line.unplug()
+            scene.unplug()
             await asyncio.sleep(20)
         await begin_anew(scene, scene.charger().orders)
         await asyncio.sleep(20)
@@ -55,8 +55,8 @@ def test_a_restart_flag_that_stays_does_not_end_our_pause(flag: str) -> None:
 
 
 @pytest.mark.parametrize("how", ["lifetime removed", "fail-safe raised", "no orders"])
-def test_a_pause_that_the_orders_do_not_tell_of(how: str) -> None:
-    """What has paused it is gone from the orders, and the pause still stands."""
+def test_a_pause_that_the_stored_orders_do_not_explain(how: str) -> None:
+    """The order that has paused it was replaced, and the pause still stands."""
 
     async def acts(scene: EwsScene) -> None:
         paused_as_0x42(scene)
@@ -82,7 +82,7 @@ def test_a_pause_that_the_orders_do_not_tell_of(how: str) -> None:
     play(EwsScene(lifetime=60.0, fail_safe=0.0), acts)
 
 
-def test_a_box_whose_counters_begin_anew_with_our_pause() -> None:
+def test_a_box_that_resets_its_counters_with_our_pause() -> None:
     async def acts(scene: EwsScene) -> None:
         port = scene.box.ports[0]
         paused_as_0x42(scene)
@@ -93,7 +93,7 @@ def test_a_box_whose_counters_begin_anew_with_our_pause() -> None:
             if port.status == 0x42:
                 port.session.seconds = port.session.wh = 0.0
 
-        scene.seen.append(begin_counters)
+        scene.watchers.append(begin_counters)
         await scene.charger().change_orders(OFF)
         await asyncio.sleep(30)
         assert len(scene.line.orders(PAUSE)) == 1
@@ -102,18 +102,18 @@ def test_a_box_whose_counters_begin_anew_with_our_pause() -> None:
     play(EwsScene(), acts)
 
 
-@pytest.mark.parametrize("heard", [True, False])
-def test_a_start_for_current_whose_end_was_not_seen(*, heard: bool) -> None:
-    """The line is lost right after the start: the next car is nobody's affair."""
+@pytest.mark.parametrize("received", [True, False])
+def test_a_start_for_current_with_an_unknown_result(*, received: bool) -> None:
+    """The line is lost right after the start: the next car is not started."""
 
     async def acts(scene: EwsScene) -> None:
         await scene.charge()
         await scene.until(lambda: scene.charger().waits_for_current, 80)
-        scene.line.mute = lambda name: name == "sl" and not heard
+        scene.line.mute = lambda name: name == "sl" and not received
         task = asyncio.ensure_future(scene.charger().change_orders(amperes(16.0)))
         await scene.until(lambda: scene.status() == 0x40)
         await asyncio.sleep(0.05)
-        scene.line.unplug()
+        scene.unplug()
         with suppress(EvseError):
             await task
         await asyncio.sleep(10)
@@ -130,18 +130,19 @@ def test_a_start_for_current_whose_end_was_not_seen(*, heard: bool) -> None:
     play(EwsScene(lifetime=60.0, fail_safe=0.0), acts)
 
 
-def test_another_car_came_while_nobody_looked() -> None:
-    """What a limit gives back it gives to the car that it was taken from."""
+def test_another_car_came_while_the_line_was_lost() -> None:
+    """The end of a pause for current is for the car that was paused."""
 
     async def acts(scene: EwsScene) -> None:
         await scene.charge()
         await scene.charger().change_orders(amperes(0.0))
-        scene.line.unplug()
+        scene.unplug(20.0)
         scene.cars[0].leave()
         await scene.until(lambda: scene.status() == 0x00)
         scene.cars[0].plug_in()
+        await scene.until(lambda: scene.status() == 0x30)
+        assert not scene.bus.connected
         await scene.until(lambda: scene.bus.connected)
-        assert scene.status() == 0x30
         begin = now()
         with suppress(EvseError):
             await scene.charger().change_orders(amperes(16.0))
@@ -152,7 +153,7 @@ def test_another_car_came_while_nobody_looked() -> None:
     play(EwsScene(), acts)
 
 
-def test_a_limit_of_zero_does_not_claim_what_others_ended() -> None:
+def test_a_limit_of_zero_does_not_claim_a_charge_stopped_at_the_box() -> None:
     async def acts(scene: EwsScene) -> None:
         await scene.charge()
         scene.box.press_key(1, 2)
@@ -169,7 +170,7 @@ def test_a_limit_of_zero_does_not_claim_what_others_ended() -> None:
     play(EwsScene(lifetime=60.0, fail_safe=0.0), acts)
 
 
-def test_a_charge_that_has_ended_is_not_started_anew() -> None:
+def test_a_charge_that_has_ended_is_not_started_again() -> None:
     """After a restart of ours it might be a pause, but its plug is free."""
 
     async def acts(scene: EwsScene) -> None:

@@ -1,4 +1,4 @@
-"""A box that was gone: how soon both of its ports are there again."""
+"""A box that was gone: how soon both of its ports are available again."""
 
 import asyncio
 
@@ -35,7 +35,7 @@ def test_a_new_line_begins_with_the_reading_that_was_right(
         await asyncio.sleep(silence)
         lost = scene.bus.wire.statistics.timeouts
         assert lost > 0
-        scene.line.unplug()
+        scene.unplug()
         scene.line.cut = False
         await scene.until(lambda: scene.bus.connected)
         await scene.until(lambda: scene.charger().reading and scene.charger(2).reading)
