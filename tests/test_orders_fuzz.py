@@ -41,6 +41,8 @@ class Disk:
     late: bool = False
     """A write that fails has replaced the file all the same."""
     read_only: bool = False
+    latency: float = 0.0
+    """s"""
     steps_left: int | None = None
     """Steps until the power fails."""
 
@@ -51,12 +53,12 @@ class Disk:
                 raise PowerFailure
 
     async def read(self, key: str) -> dict[str, Any] | None:
-        await asyncio.sleep(0)
+        await asyncio.sleep(self.latency)
         text = self.files.get(key)
         return None if text is None else dict(json.loads(text))
 
     async def write(self, key: str, data: dict[str, Any]) -> Exception | None:
-        await asyncio.sleep(0)
+        await asyncio.sleep(self.latency)
         self.step()
         refused = self.full or self.read_only
         if not refused or (self.late and not self.read_only):
@@ -65,7 +67,7 @@ class Disk:
         return OSError(28, "No space left on device") if refused else None
 
     async def remove(self, key: str) -> None:
-        await asyncio.sleep(0)
+        await asyncio.sleep(self.latency)
         self.step()
         if self.read_only:
             raise OSError(30, "Read-only file system")
