@@ -260,9 +260,10 @@ async def test_a_household_socket_has_no_limit(hass: HomeAssistant) -> None:
     async with running(hass, box, fail_safe_current=16.0) as (entry, bus):
         limit = await get_entity(hass, "number", entry, "2_charging_current")
         switch = await get_entity(hass, "switch", entry, "2_charging_allowed")
-        with pytest.raises(HomeAssistantError):
-            await call(hass, "number.set_value", limit, value=10)
+        reason = await get_entity(hass, "sensor", entry, "2_pause_reason")
+        await call(hass, "number.set_value", limit, value=10)
         assert not limits(box, 2)
+        await wait_for_state(hass, reason, "limit_too_low")
         # What it does not have is nowhere, and the other port has it.
         await get_entity(hass, "sensor", entry, "2_status")
         await hass.async_block_till_done()
@@ -275,8 +276,13 @@ async def test_a_household_socket_has_no_limit(hass: HomeAssistant) -> None:
             assert entity_id(hass, platform, entry, f"1_{key}")
             assert not entity_id(hass, platform, entry, f"2_{key}")
         await plug_in(bus, box, 2)
-        await call(hass, "switch.turn_on", switch)
         status = await get_entity(hass, "sensor", entry, "2_status")
+        await wait_for_state(hass, status, "preparing")
+        await call(hass, "switch.turn_on", switch)
+        await polled(bus, box)
+        assert not orders(box, 2)
+        assert state_of(hass, switch) == "on"
+        await call(hass, "number.set_value", limit, value=16)
         await wait_for_state(hass, status, "charging")
         await call(hass, "switch.turn_off", switch)
         assert not box.ports[1].contactor

@@ -39,6 +39,7 @@ class EwsPort(EwsReader):
     @override
     def on_line_open(self) -> None:
         super().on_line_open()
+        self.permission.on_lost()
         self._reassert_after = -inf
         self._urgent_waits = False
 
@@ -124,6 +125,8 @@ class EwsPort(EwsReader):
                 allowed = self.order_to_send(change).allowed is not False
                 await self.permission.pause(turn, for_current=allowed)
                 self._check_possible(change)
+                if change.allowed is True and self.order_to_send(change).allowed:
+                    self.permission.withhold_start()
                 return
             await self.limiter.enforce(turn, lambda: self.order_to_send(change))
             if not self.permission.may_start(change):

@@ -162,6 +162,8 @@ class Permission:
         self._port = port
         self._tracker = PauseTracker()
         self._started_at = -inf
+        self._start_withheld = False
+        """The user allows the car that waits, and the limit is too low for it."""
 
     # -- State -----------------------------------------------------------------------
 
@@ -172,11 +174,13 @@ class Permission:
 
     @property
     def waits_for_current(self) -> bool:
-        """Return whether a limit of 0 A has paused it, so that a higher one ends it."""
-        return self._tracker.for_current
+        """Return whether only the limit is too low: a higher one lets the car charge."""
+        return self._tracker.for_current or self._start_withheld
 
     def on_status(self, status: PortStatus) -> None:
-        """Check by a status whether our pause still stands."""
+        """Check by a status whether our pause still stands, or a start is withheld."""
+        if status.state != WAITING or status.start is StartRelease.RELEASED:
+            self._start_withheld = False
         installation = self._port.box.installation
         has_lock = installation is not None and installation.fixed_cable is False
         self._tracker.on_status(status, self._port.now, has_lock=has_lock)
@@ -184,10 +188,27 @@ class Permission:
     def forget(self) -> None:
         """Take note that a command has stopped the charge or unlocked the plug."""
         self._tracker.end()
+        self._start_withheld = False
 
     def doubt(self) -> None:
         """Take note that the box has restarted: our pause may be over."""
         self._tracker.doubt()
+        self._start_withheld = False
+
+    def on_lost(self) -> None:
+        """Take note that the port is out of sight: another car may come unnoticed."""
+        self._start_withheld = False
+
+    def withhold_start(self) -> None:
+        """Take note that the user allows a charge for which the limit is too low."""
+        status = self._port.last_status
+        if status is None:
+            return
+        tracker = self._tracker
+        if status.state == WAITING and status.start is not StartRelease.RELEASED:
+            self._start_withheld = True
+        elif tracker.pause is not Pause.NONE and status.state in AFTER_OUR_PAUSE:
+            tracker.for_current = True
 
     def is_paused(self, status: PortStatus) -> bool | None:
         """Return whether the port is in our pause; ``None``: it may be."""
@@ -214,8 +235,8 @@ class Permission:
     def may_start(self, change: OrderChange) -> bool:
         """Return whether a change of the orders may start a car.
 
-        The user's permission may. A limit may only end the pause that a limit of 0 A
-        has begun.
+        The user's permission may. A limit may only end the pause that a lower one has
+        begun, or start the car that the user allowed meanwhile.
         """
         if change.allowed is True:
             return True
@@ -242,13 +263,13 @@ class Permission:
     async def pause(self, turn: Turn, *, for_current: bool) -> None:
         """Pause a charge under way; its cable stays locked.
 
-        ``for_current``: charging is allowed, and only the limit of 0 A demands it.
+        ``for_current``: charging is allowed, and only the limit is too low for it.
         Raises NotConfirmedError when the charge goes on, EwsRefusedError, and what
         `BoxPort.read_status` raises.
         """
         tracker = self._tracker
         if not for_current:
-            tracker.for_current = False
+            tracker.for_current = self._start_withheld = False
         sends = 0
         status = await self._read_status(turn)
         while self._can_pause(status):
@@ -298,10 +319,10 @@ class Permission:
         """Start the car that waits, or end our pause; without either, do nothing.
 
         ``is_wanted`` is called right before each order. ``for_current``: only a limit
-        demands it, for the car that a limit has paused. Raises NotAvailableError in a
-        state in which nothing can be started, NotConfirmedError when the charge does
-        not start or is aborted at once, EwsRefusedError, SupersededError, and what
-        `BoxPort.read_status` raises.
+        demands it, for the car that a lower limit has paused or kept from its start.
+        Raises NotAvailableError in a state in which nothing can be started,
+        NotConfirmedError when the charge does not start or is aborted at once,
+        EwsRefusedError, SupersededError, and what `BoxPort.read_status` raises.
         """
         patience = turn.now + READY_PATIENCE
         sent_at: float | None = None
@@ -327,7 +348,7 @@ class Permission:
             else:
                 sent_at = None
                 await self._wait_for_boot(turn, patience)
-        self._tracker.for_current = False
+        self._tracker.for_current = self._start_withheld = False
 
     def _has_started(self, status: PortStatus, *, settled: bool) -> bool:
         tracker = self._tracker
