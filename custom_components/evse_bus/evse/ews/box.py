@@ -323,7 +323,7 @@ class EwsBox:
     # -- Ports ---------------------------------------------------------------------
 
     async def refresh(self, turn: Turn, oldest: float) -> None:
-        """Read the records older than ``oldest`` (loop time, s): up to three exchanges."""
+        """Read records older than ``oldest`` (loop time, s): up to three exchanges."""
         if self._ports_read_at < oldest or self.details is None:
             await self.read_ports(turn)
             await self.read_details(turn)
