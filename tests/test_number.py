@@ -179,7 +179,10 @@ async def test_evbox_fail_safe_values(hass: HomeAssistant) -> None:
         order = orders_in(bus.log.bursts())[-1]
         assert order.fallback == (8, 8, 8)
         assert order.timeout == 90
-        # Below the minimum there is no charging, but a fail-safe may be 0 too.
+        assert range_of(hass, current) == (0, 16, 0.1)
+        # Below the minimum there is no charging, but a fail-safe may be that too.
+        await call(hass, "number.set_value", current, value=3)
+        assert orders_in(bus.log.bursts())[-1].fallback == (3, 3, 3)
         await call(hass, "number.set_value", current, value=0)
         assert orders_in(bus.log.bursts())[-1].fallback == (0, 0, 0)
         for value in (nan, 0, 4000):

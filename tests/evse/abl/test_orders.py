@@ -400,7 +400,7 @@ async def test_a_lost_port_and_back() -> None:
 
 _changes = st.lists(
     st.one_of(
-        st.sampled_from([0.0, 6.0, 7.3, 10.0, 15.9, 16.0]).map(limit),
+        st.sampled_from([0.0, 3.0, 5.9, 6.0, 7.3, 10.0, 15.9, 16.0]).map(limit),
         st.just(OFF),
         st.just(ON),
     ),
