@@ -5,7 +5,7 @@ jump for other reasons: a box was exchanged, or another module took its address.
 the total continues from its old value, with the new meter.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 HIGHEST_POWER: Final = 3 * 80.0 * 250.0
@@ -22,30 +22,33 @@ class MeterTotal:
     """Wh; equal to the value of the first meter as long as that stays."""
     generation: int | None = None
     """Generation of the last meter; ``None``: none read since the start."""
+    _offsets: dict[int, float] = field(default_factory=dict)
+    """Offsets of former generations, which the meter may resume, Wh."""
 
     def update(self, meter: float, generation: int, downtime: float = 0.0) -> float:
         """Return the total for a value of the meter, both in Wh.
 
         ``downtime``: time since the total was stored before a restart, s.
         """
-        now = self.offset + meter
-        if self.total is not None and not self._is_same_meter(
-            now, generation, downtime
+        if self.generation is None:
+            # After a restart the generation is unknown: judge by the possible energy.
+            is_known = self.total is None or (
+                0
+                <= self.offset + meter - self.total
+                <= HIGHEST_POWER * downtime / 3600 + 1
+            )
+        else:
+            self._offsets[self.generation] = self.offset
+            is_known = generation in self._offsets
+            self.offset = self._offsets.get(generation, 0.0)
+        if self.total is not None and (
+            not is_known or self.offset + meter < self.total
         ):
+            # What it has counted before is no consumption.
             self.offset = self.total - meter
-            now = self.total
         self.generation = generation
-        self.total = now
-        return now
-
-    def _is_same_meter(self, now: float, generation: int, downtime: float) -> bool:
-        """Return whether this can be the same meter as before."""
-        if self.total is None:
-            return True
-        if self.generation is not None:
-            return generation == self.generation and now >= self.total
-        # After a restart the generation is unknown: judge by the possible energy.
-        return 0 <= now - self.total <= HIGHEST_POWER * downtime / 3600 + 1
+        self.total = max(self.offset + meter, self.total or 0.0)
+        return self.total
 
 
 @dataclass(slots=True)

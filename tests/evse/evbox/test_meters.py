@@ -1,9 +1,10 @@
-"""No energy total is highest_current from one module to another."""
+"""No energy total is carried from one module to another."""
 
 from hypothesis import given, strategies as st
 import pytest
 
-from custom_components.evse_bus.evse.evbox.meters import SLACK, Meters, most_energy
+from custom_components.evse_bus.evse.evbox.meters import Meters
+from custom_components.evse_bus.evse.meter import SLACK, Total, most_energy
 
 CURRENT = 35.0
 
@@ -17,10 +18,13 @@ class Receiver:
 
     def update(self, *totals: int) -> tuple[float | None, ...]:
         self.now += 5.0
-        return self.meters.update(totals, self.now, CURRENT)
+        return tuple(self.meters.update(self._at(totals), CURRENT))
+
+    def _at(self, totals: tuple[int, ...], later: float = 0.0) -> tuple[Total, ...]:
+        return tuple(Total(total, self.now + later) for total in totals)
 
     def jumps(self, *totals: int) -> dict[int, float]:
-        return self.meters.jumps(totals, self.now + 5.0, CURRENT)
+        return self.meters.jumps(self._at(totals, 5.0), CURRENT)
 
     def generations(self, count: int) -> list[int]:
         return [self.meters.generation(index) for index in range(count)]
@@ -63,6 +67,14 @@ def test_an_accepted_jump_is_another_meter() -> None:
     receiver = settled(5000, 7000)
     assert receiver.update(5000, 90_000) == (5000, 90_000)
     assert receiver.generations(2) == [0, 1]
+
+
+def test_a_meter_that_is_back_at_its_former_total_resumes() -> None:
+    receiver = settled(5000, 7000)
+    receiver.update(0, 7000)
+    assert receiver.generations(2) == [1, 0]
+    receiver.update(5000, 7000)
+    assert receiver.generations(2) == [0, 0]
 
 
 def test_an_added_module_is_unknown_at_first_and_the_others_continue() -> None:

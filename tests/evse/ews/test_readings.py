@@ -19,6 +19,7 @@ from custom_components.evse_bus.evse.ews.wire.status import (
     decode_details,
     decode_ports,
 )
+from custom_components.evse_bus.evse.meter import MeterReading
 from custom_components.evse_bus.evse.model import Capability, SessionResult
 from custom_components.evse_bus.evse.readings import ConnectorReading
 from tests.virtual.ews_rfid import Card as VirtualCard
@@ -46,6 +47,7 @@ def connector(port: int = 1, **changes: object) -> ConnectorReading:
     ports[port - 1] = replace(ports[port - 1], **changes)  # type: ignore[arg-type]
     snapshot = Snapshot(
         ports=tuple(ports),
+        meters=tuple(MeterReading(one.total_energy, 3) for one in ports),
         details=decode_details(DETAILS),
         status=decode_box(BOX),
         installation=Installation(),
@@ -90,6 +92,7 @@ def test_the_bits_and_voltages_are_of_the_right_port() -> None:
         assert reading.proximity_voltage == status.cable_voltage
         assert reading.last_end == details.last_end[port - 1]
         assert reading.energy == status.total_energy
+        assert reading.meter_generation == 3
 
 
 # -- Capabilities -------------------------------------------------------------------

@@ -2,46 +2,16 @@
 
 A total is shown only while it certainly continues the one before. When the number of
 modules changes, or a total jumps and stays, the module at an index may be another one:
-the generation of that index counts up, so that no total is carried from one module to
-another (PROTOCOLS.md section 1).
+the meter of that index gets a new generation, so that no total is carried from one
+module to another (PROTOCOLS.md section 1).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
 
-SLACK: Final = 100
-"""Largest step of a coarse meter, Wh."""
-HIGHEST_PHASE_VOLTAGE: Final = 265.0
-"""230 V + 15 %, V: the highest voltage behind a total."""
-_PHASES: Final = 3
-_SECONDS_PER_HOUR: Final = 3600.0
+from ..meter import Meter, Total
 
-
-def most_energy(seconds: float, current: float) -> float:
-    """Return the most a meter can count in a time at a current on 3 phases, Wh."""
-    power = current * _PHASES * HIGHEST_PHASE_VOLTAGE
-    return SLACK + power * max(seconds, 0.0) / _SECONDS_PER_HOUR
-
-
-@dataclass(frozen=True, slots=True)
-class Totals:
-    """The totals of all modules at one time."""
-
-    totals: tuple[int, ...]
-    """Wh, by index of the module."""
-    at: float
-    """s"""
-
-    def can_grow_to(self, index: int, later: int, at: float, current: float) -> bool:
-        """Return whether a later total at this index may be of the same meter.
-
-        ``later``: Wh, ``at``: its time, s, ``current``: the most a module carries, A.
-        """
-        if index >= len(self.totals):
-            return False
-        growth = later - self.totals[index]
-        return 0 <= growth <= most_energy(at - self.at, current)
+type Totals = tuple[Total, ...]
+"""The totals of all modules, by index."""
 
 
 class Meters:
@@ -51,7 +21,8 @@ class Meters:
         """Start without totals."""
         self._confirmed: Totals | None = None
         self._unconfirmed: Totals | None = None
-        self._generations: dict[int, int] = {}
+        self._meters: list[Meter] = []
+        """By index, those of modules that are gone included."""
 
     @property
     def unconfirmed(self) -> bool:
@@ -59,73 +30,69 @@ class Meters:
         return self._unconfirmed is not None
 
     def generation(self, index: int) -> int:
-        """Return how often the meter at this index has changed."""
-        return self._generations.get(index, 0)
+        """Return the generation of the meter at this index."""
+        if index >= len(self._meters):
+            return 0
+        return self._meters[index].reading.generation
 
     def require_confirmation(self) -> None:
         """Show no total until two replies agree: the ChargePoint was away."""
         if self._confirmed is not None and self._unconfirmed is None:
             # Totals of no module: none can grow from them, so two more are needed.
-            self._unconfirmed = Totals((), self._confirmed.at)
+            self._unconfirmed = ()
 
-    def jumps(
-        self, totals: Sequence[int], now: float, current: float
-    ) -> dict[int, float]:
+    def jumps(self, totals: Totals, current: float) -> dict[int, float]:
         """Return the totals that do not continue the ones before, Wh, by index.
 
         ``current`` is the most one module can carry, A. A change of the number of
         modules is no jump; `update` deals with it.
         """
         before = self._confirmed
-        if self.unconfirmed or before is None or len(before.totals) != len(totals):
+        if self.unconfirmed or before is None or len(before) != len(totals):
             return {}
         return {
-            index: total
+            index: total.energy
             for index, total in enumerate(totals)
-            if not before.can_grow_to(index, total, now, current)
+            if not before[index].can_grow_to(total, current)
         }
 
-    def update(
-        self, totals: Sequence[int], now: float, current: float
-    ) -> tuple[float | None, ...]:
+    def update(self, totals: Totals, current: float) -> Sequence[float | None]:
         """Accept the totals of a reply; return those that may be shown, Wh."""
-        new = Totals(tuple(totals), now)
-        unknown = (None,) * len(new.totals)
-        known = self._unconfirmed or self._confirmed
-        if known is None or len(known.totals) != len(new.totals):
-            self._unconfirmed = new
-            return unknown
+        known = self._confirmed if self._unconfirmed is None else self._unconfirmed
+        if known is None or len(known) != len(totals):
+            self._unconfirmed = totals
+            return [None] * len(totals)
         if self._unconfirmed is not None:
             agrees = all(
-                self._unconfirmed.can_grow_to(index, total, now, current)
-                for index, total in enumerate(new.totals)
+                before.can_grow_to(total, current)
+                for before, total in zip(self._unconfirmed, totals, strict=True)
             )
             if not agrees:
-                self._unconfirmed = new
-                return unknown
+                self._unconfirmed = totals
+                return [None] * len(totals)
             self._unconfirmed = None
-        self._count_generations(new, current)
-        self._confirmed = new
-        return new.totals
+        self._take(totals, current)
+        self._confirmed = totals
+        return [total.energy for total in totals]
 
-    def _count_generations(self, new: Totals, current: float) -> None:
-        """Count up the generation of each index whose meter may be another one."""
-        before = self._confirmed or Totals((), new.at)
-        same_count = len(before.totals) == len(new.totals)
-        for index, total in enumerate(new.totals):
-            if index >= len(before.totals):
-                # An index that was gone for a while starts a new generation.
-                if index in self._generations:
-                    self._generations[index] += 1
-                continue
-            continues = before.can_grow_to(index, total, new.at, current)
-            # Where the number of modules changed, a second match makes it ambiguous.
-            ambiguous = not same_count and any(
-                before.can_grow_to(other, total, new.at, current)
-                for other in range(len(before.totals))
-                if other != index
+    def _take(self, totals: Totals, current: float) -> None:
+        """Give each total to the meter of its index, or to a new generation of it."""
+        before = self._confirmed or ()
+        same_count = len(before) == len(totals)
+        for index, total in enumerate(totals):
+            if index >= len(self._meters):
+                self._meters.append(Meter())
+            # Where the number of modules changed, a second match makes it ambiguous,
+            # and an index that was gone for a while starts a new generation.
+            continues = index < len(before) and before[index].can_grow_to(
+                total, current
             )
-            if not continues or ambiguous:
-                self._generations[index] = self.generation(index) + 1
-        for index in range(len(new.totals)):
-            self._generations.setdefault(index, 0)
+            ambiguous = any(
+                other.can_grow_to(total, current)
+                for at, other in enumerate(before)
+                if at != index
+            )
+            if same_count or (continues and not ambiguous):
+                self._meters[index].take(total, current)
+            else:
+                self._meters[index].renew(total)

@@ -18,13 +18,12 @@ from enum import StrEnum
 from typing import Final
 
 from ..errors import ImplausibleReplyError
+from ..meter import CONFIRMATIONS, Total
 from ..model import MAXIMUM_CURRENT, MINIMUM_CURRENT, Phases
 from .config import UNKNOWN_INTERVAL
 from .frames import ModuleReply, Reply
 from .meters import Meters, Totals
 
-CONFIRMATIONS: Final = 3
-"""Consistent replies in a row that are accepted although they are implausible."""
 LARGEST_CONNECTION: Final = 1000.0
 """Highest maximum phase current of a connection, A: 20 modules of 32 A are 640 A."""
 LONGEST_INTERVAL: Final = 600
@@ -216,10 +215,10 @@ class Plausibility:
         """
         highest = self._highest_current(reply)
         implausible = implausible_values(reply, highest)
-        totals = tuple(module.energy for module in reply.modules)
-        for index, total in self.meters.jumps(totals, now, highest).items():
+        totals = tuple(Total(module.energy, now) for module in reply.modules)
+        for index, total in self.meters.jumps(totals, highest).items():
             implausible[Quantity.METER, index, None] = total
-        checked = _Checked(reply, implausible, Totals(totals, now))
+        checked = _Checked(reply, implausible, totals)
         if implausible and not self._is_confirmed(checked, highest):
             names = ", ".join(sorted({str(quantity) for quantity, _, _ in implausible}))
             message = f"implausible reply quarantined ({names})"
@@ -257,7 +256,7 @@ class Plausibility:
             default=MINIMUM_CURRENT,
         )
         self.minimum.update(max(smallest, MINIMUM_CURRENT))
-        shown = self.meters.update(checked.totals.totals, checked.totals.at, highest)
+        shown = tuple(self.meters.update(checked.totals, highest))
         return AcceptedReply(
             reply=reply,
             totals=shown,
@@ -278,7 +277,7 @@ def _consistent(first: _Checked, second: _Checked, highest: float) -> bool:
     if _over_currents(first) and not common:
         return False
     return all(
-        first.totals.can_grow_to(place[1] or 0, int(value), second.totals.at, highest)
+        first.totals[place[1] or 0].can_grow_to(second.totals[place[1] or 0], highest)
         if place[0] is Quantity.METER
         else _agree(place[0], first.implausible[place], value)
         for place, value in second.implausible.items()

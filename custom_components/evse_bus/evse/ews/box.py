@@ -15,9 +15,15 @@ from math import inf
 from typing import Final
 
 from ..conversation import rest
-from ..errors import ExchangeError, LineError, ReplyTimeoutError
+from ..errors import (
+    ExchangeError,
+    ImplausibleReplyError,
+    LineError,
+    ReplyTimeoutError,
+)
 from ..events import CardPresented, Events
 from ..exchange import Turn
+from ..meter import CONFIRMATIONS, Meter, MeterReading, Total
 from ..throttle import RateLimiter
 from .timing import (
     BOX_INTERVAL,
@@ -34,6 +40,8 @@ from .wire.info import Change, Info
 from .wire.parameters import EXTRA_BLOCK, SYSTEM_BLOCK, SystemMode, SystemParameters
 from .wire.status import Details, Pair, PortStatus, decode_details, decode_ports
 
+MOST_READS: Final = 2 * CONFIRMATIONS
+"""Most readings of ``rc`` in a row until its meters are plausible or confirmed."""
 MOST_KEYS: Final = 100
 """Most key events reported per second: more cannot come from people."""
 _TRIES_PER_OTHER_BCC: Final = 3
@@ -58,6 +66,8 @@ class Snapshot:
     """All readings of a box."""
 
     ports: tuple[PortStatus, ...]
+    meters: tuple[MeterReading, ...]
+    """Of the ports: their accepted totals."""
     details: Details
     status: BoxStatus
     installation: Installation
@@ -79,6 +89,8 @@ class EwsBox:
         """Restarts that the box has reported."""
         self.bcc: Bcc | None = None
         """The checksum it uses; ``None``: not known."""
+        self.meters: Pair[Meter] = (Meter(), Meter())
+        """Of the ports. They stay while it is away: another box's totals jump."""
         self._key_limiter = RateLimiter(MOST_KEYS, 1.0)
         self._opened = -1
         self._tries = 0
@@ -128,6 +140,7 @@ class EwsBox:
             return None
         return Snapshot(
             ports=self.ports,
+            meters=tuple(meter.reading for meter in self.meters),
             details=self.details,
             status=self.status,
             installation=self.installation,
@@ -331,14 +344,34 @@ class EwsBox:
             await self.read_status(turn)
 
     async def read_ports(self, turn: Turn) -> tuple[PortStatus, ...]:
-        """Read ``rc``: the status of the ports."""
+        """Read ``rc``: the status of the ports.
+
+        One with an implausible meter total may be damaged as a whole: nothing of it
+        counts, and it is read again, one exchange a turn, until the total is confirmed.
+        Raises ImplausibleReplyError if it never is, and what `read` raises.
+        """
         known = self.installation or Installation()
         decode = partial(decode_ports, mode_1=known.mode_1, count=known.ports)
-        infos = self.info_count
-        self.ports = await self.read(turn, CommandId.READ_PORTS, decode)
-        # An info record that came meanwhile has outdated it.
-        self._ports_read_at = turn.now if infos == self.info_count else -inf
-        return self.ports
+        for _ in range(MOST_READS):
+            infos = self.info_count
+            ports = await self.read(turn, CommandId.READ_PORTS, decode)
+            if self._check_meters(ports, turn.now):
+                self.ports = ports
+                # An info record that came meanwhile has outdated it.
+                self._ports_read_at = turn.now if infos == self.info_count else -inf
+                return ports
+            await rest(0.0)
+        message = "rc: implausible meter totals that do not agree"
+        raise ImplausibleReplyError(message)
+
+    def _check_meters(self, ports: tuple[PortStatus, ...], now: float) -> bool:
+        """Return whether the totals of all ports are accepted."""
+        # All are checked, also after one that is not accepted.
+        accepted = [
+            meter.check(Total(port.total_energy, now))
+            for meter, port in zip(self.meters, ports, strict=False)
+        ]
+        return all(accepted)
 
     async def read_details(self, turn: Turn) -> Details:
         """Read ``rd``: limit and power of the ports."""

@@ -125,6 +125,7 @@ def charger_reading(port: int, box: Snapshot, *, paused: bool | None) -> Charger
     """
     at = port - 1
     status, details, installation = box.ports[at], box.details, box.installation
+    meter = box.meters[at]
     fixed = installation.fixed_cable
     state = port_state(status, fixed_cable=fixed, paused=paused is True)
     connector = ConnectorReading(
@@ -133,7 +134,8 @@ def charger_reading(port: int, box: Snapshot, *, paused: bool | None) -> Charger
         plugged=state.plugged,
         charging=state.charging,
         power=float(details.power[at]),
-        energy=float(status.total_energy),
+        energy=meter.energy,
+        meter_generation=meter.generation,
         session_energy=float(status.session_energy),
         session_time=status.session_time,
         last_session_energy=float(status.last_energy),

@@ -108,6 +108,8 @@ class Services:
 
         async def write(turn: Turn) -> None:
             await port.read_status(turn)
+            # Also if its reply is lost: the total may have been set.
+            port.box.meters[port.number - 1].expect(total)
             await port.box.send_command(turn, CommandId.SET_METER, lambda: request)
 
         await self._run(write)
