@@ -92,8 +92,8 @@ async def test_not_a_number_says_why(hass: HomeAssistant) -> None:
         limit = await get_entity(hass, "number", entry, "charging_current")
         with pytest.raises(ServiceValidationError) as refused:
             await call(hass, "number.set_value", limit, value=nan)
-        assert refused.value.translation_key == "order_refused"
-        assert "finite" in str(refused.value)
+        assert refused.value.translation_key == "field_number"
+        assert "Charging current must be a number from 0 to 16" in str(refused.value)
 
 
 async def test_the_slider_does_not_follow_the_reading(hass: HomeAssistant) -> None:

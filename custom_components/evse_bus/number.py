@@ -29,9 +29,8 @@ from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
 
 from .coordinator import BusCoordinator, EvseBusConfigEntry
 from .entity import BusEntity, ChargerEntity, SettingEntity, add_charger_entities
-from .errors import translated_errors
+from .errors import ActionError, translated_errors, wrong_action
 from .evse.charger import Charger
-from .evse.errors import RefusedOrderError
 from .evse.model import (
     Capability,
     CurrentLimit,
@@ -41,7 +40,6 @@ from .evse.model import (
     Phases,
     Setting,
 )
-from .evse.safety import number
 from .managed_charger import ManagedCharger
 from .supply import STEP, SharedSupply
 
@@ -158,10 +156,7 @@ NUMBERS: Final[tuple[OrderNumberDescription, ...]] = (
         mode=NumberMode.BOX,
         exists=_has(Capability.FAIL_SAFE_TIMEOUT),
         value=lambda orders, _limits: orders.fail_safe_timeout,
-        # `number` raises RefusedOrderError for NaN, int() ValueError.
-        change=lambda value: OrderChange(
-            fail_safe_timeout=int(number(value, "fail-safe time-out"))
-        ),
+        change=lambda value: OrderChange(fail_safe_timeout=floor(value)),
         lowest=1,
         highest=lambda _limits: LONGEST_TIMEOUT,
         finest=lambda _limits: 1,
@@ -218,18 +213,6 @@ SETTINGS: Final[tuple[SettingNumberDescription, ...]] = (
 )
 
 
-def whole_number(value: float) -> int:
-    """Return the value of a setting rounded down, as a box stores it.
-
-    Raises RefusedOrderError unless it is finite: NaN passes Home Assistant's own range
-    check.
-    """
-    if not isfinite(value):
-        message = f"not a finite number: {value!r}"
-        raise RefusedOrderError(message)
-    return floor(value)
-
-
 # -- Shared supply ---------------------------------------------------------------
 
 SUPPLY: Final = NumberEntityDescription(
@@ -238,6 +221,20 @@ SUPPLY: Final = NumberEntityDescription(
 
 
 # -- Entities --------------------------------------------------------------------
+
+
+def check_finite(entity: NumberEntity, value: float) -> None:
+    """Raise ServiceValidationError, which names the range, unless a value is finite.
+
+    Home Assistant's own range check lets NaN through.
+    """
+    if not isfinite(value):
+        raise wrong_action(
+            ActionError.FIELD_NUMBER,
+            field=entity.name,
+            minimum=f"{entity.min_value:g}",
+            maximum=f"{entity.max_value:g}",
+        )
 
 
 async def async_setup_entry(
@@ -294,6 +291,7 @@ class OrderNumber(ChargerEntity, NumberEntity):
     @override
     async def async_set_native_value(self, value: float) -> None:
         """Change the order; return when the charger has confirmed it."""
+        check_finite(self, value)
         with translated_errors(self.managed.name, self.coordinator.port):
             await self.charger.change_orders(self._order.change(value))
 
@@ -322,8 +320,9 @@ class SettingNumber(SettingEntity, NumberEntity):
     @override
     async def async_set_native_value(self, value: float) -> None:
         """Write the value to the box; return when it is read back."""
+        check_finite(self, value)
         with translated_errors(self.managed.name, self.coordinator.port):
-            await self.charger.configure(self.setting, whole_number(value))
+            await self.charger.configure(self.setting, floor(value))
 
 
 class SupplyNumber(BusEntity, NumberEntity):
@@ -346,6 +345,7 @@ class SupplyNumber(BusEntity, NumberEntity):
     @override
     async def async_set_native_value(self, value: float) -> None:
         """Change the limit; return when it is in effect."""
+        check_finite(self, value)
         with translated_errors(
             self.coordinator.config_entry.title, self.coordinator.port
         ):
