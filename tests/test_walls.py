@@ -23,6 +23,7 @@ PURE = (
     "probing",
     "duty",
     "states",
+    "decisions",
     "plausibility",
 )
 """Files of a protocol folder that know no line and no conversation, beside `wire/`."""

@@ -523,6 +523,7 @@ def encode(record: Record[Any]) -> dict[str, Any]:
             "limit": _encode_limit(order.limit),
             "fail_safe": _encode_limit(order.fail_safe),
             "fail_safe_timeout": order.fail_safe_timeout,
+            "remembered": dict(order.remembered),
         }
     )
     return data | {"lost": record.lost}
@@ -545,6 +546,9 @@ def decode(stored: Mapping[str, Any]) -> Record[Any]:
         limit=_decode_limit(stored["limit"]),
         fail_safe=_decode_limit(stored["fail_safe"]),
         fail_safe_timeout=int(number(stored["fail_safe_timeout"], "time-out")),
+        remembered={
+            str(name): str(note) for name, note in stored.get("remembered", {}).items()
+        },
     )
     return Record(orders, str(stored["owner"]), lost=lost)
 

@@ -1,4 +1,4 @@
-"""A virtual ABL EVCC2/3 on the bus, written from the manual."""
+"""A virtual ABL EVCC2/3 on the bus, from the manual and the bytes of real boxes."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 from .abl_frames import (
     BROADCAST,
     FAILURE,
-    LOWEST_DUTY,
-    NO_CURRENT,
     READ,
     WRITE,
     WRITE_FAILED,
@@ -18,7 +16,7 @@ from .abl_frames import (
     line,
 )
 from .abl_outlet import Outlet
-from .abl_registers import BLOCKS, BROADCAST_READS, EXTRA_BLOCKS
+from .abl_registers import BLOCKS, BROADCAST_READS, EXTRA_BLOCKS, ICMAX_BLOCK
 from .device import Device, on_bus_thread
 
 if TYPE_CHECKING:
@@ -48,8 +46,12 @@ class AblBox(Device):
     - `device_id`: 1 to 16; `serial`: 14 characters
     - `writes`: every well-formed write
     - `answer_register`: sent in place of the right register number (a defect)
-    - `unreadable_in_b2`: reports 0x3E8 also in B2; `l3_first`: phase order reversed
+    - `unreadable_in_b2`: reports 0x3E8 also in B2
+    - `l3_first`: L1 in the third word, as all public one-phase loads [trace, notes]
+    - `tells_icmax`: answers 0x0F; every box in use with the programs that read it does
     - `sleep_after` (s, None = never), `wake_time`, `wakes_on`: see the README
+    - `lost_asleep_each`: requests lost in each sleep: one [trace], several [some say]
+    - `stray`: bytes before the first reply after a sleep [code of two projects]
     """
 
     parity: ClassVar[str] = "E"
@@ -71,6 +73,7 @@ class AblBox(Device):
         wake_time: float = 0.3,
         wakes_on: Literal["any", "own"] = "any",
         extra_registers: bool = False,
+        tells_icmax: bool = True,
         turn_round: float = 0.002,
         jitter: float = 0.0005,
         boot_time: float = 0.3,
@@ -100,12 +103,16 @@ class AblBox(Device):
         self.wake_time = wake_time
         self.wakes_on = wakes_on
         self.extra_registers = extra_registers
+        self.tells_icmax = tells_icmax
+        self.icmax_byte = 0x3F
+        self.lost_asleep_each = 1
+        self.stray = b""
         self.turn_round = turn_round
         self.jitter = jitter
         self.boot_time = boot_time
         self.answer_register: int | None = None
         self.unreadable_in_b2 = False
-        self.l3_first = False
+        self.l3_first = True
         self.writes: list[Write] = []
         self.refused = 0
         self.ignored = 0
@@ -114,6 +121,8 @@ class AblBox(Device):
         self._finder = LineFinder()
         self._deaf_until = float("-inf")
         self._active_at: float | None = None
+        self._still_lost = 0
+        self._woken = False
         self._configuration = 0
         self._contacted = False
 
@@ -134,7 +143,7 @@ class AblBox(Device):
         """Return whether the next request will be lost."""
         if self.sleep_after is None:
             return False
-        if self._active_at is None:
+        if self._active_at is None or self._still_lost:
             return True
         return self.now() - self._active_at > self.sleep_after
 
@@ -221,6 +230,9 @@ class AblBox(Device):
             if answer is None:
                 self.ignored += 1
             else:
+                if self._woken:
+                    answer = self.stray + answer
+                self._woken = False
                 wait = self.turn_round
                 if self.bus is not None:
                     wait += self.bus.rng.random() * self.jitter
@@ -228,6 +240,11 @@ class AblBox(Device):
 
     def _wake(self, segment: Segment) -> None:
         self.lost_asleep += 1
+        if self._still_lost:
+            self._still_lost -= 1
+        else:
+            self._still_lost = self.lost_asleep_each - 1
+        self._woken = True
         self._deaf_until = segment.end + self.wake_time
 
     def _answer(self, request: Request) -> bytes | None:
@@ -254,7 +271,11 @@ class AblBox(Device):
         return line(">", bytes((own_id, WRITE)) + request.data[:4])
 
     def _read(self, request: Request) -> bytes | None:
-        blocks = BLOCKS | EXTRA_BLOCKS if self.extra_registers else BLOCKS
+        blocks = dict(BLOCKS)
+        if self.tells_icmax:
+            blocks |= ICMAX_BLOCK
+        if self.extra_registers:
+            blocks |= EXTRA_BLOCKS
         quantity, content = blocks.get(request.register, (None, None))
         if len(request.data) != 4 or request.quantity != quantity or not content:
             return None
@@ -269,11 +290,7 @@ class AblBox(Device):
 
     def _write(self, register: int, value: int) -> bool:
         if register == 0x14:
-            if not LOWEST_DUTY <= value <= NO_CURRENT:
-                return False
-            if not self.outlet.ignore_limit:
-                self.outlet.icmax = value
-            return True
+            return self.outlet.write_icmax(value, self.now())
         if register == 0x2C:
             return self._configure(value)
         return self._modify_state(value)

@@ -23,6 +23,10 @@ WRITE_FAILED = 0x04
 BROADCAST = 0
 NO_CURRENT = 0x3E8
 LOWEST_DUTY = 0x50
+# Codes below are taken as this one, and a 5 % pilot begins at 50 (abl_field.md, "What
+# 0x14 takes", firmware 4.1; the manual refuses below 0x50).
+SIX_AMPS = 100
+LOWEST_PILOT = 50
 # Modbus ASCII: a pause of more than a second inside a frame ends it.
 LONGEST_PAUSE = 1.0
 LONGEST = 600

@@ -1,14 +1,22 @@
 """The outlet of a virtual ABL EVCC2/3: states, limits, meter. No wire.
 
 States and their meaning: manual, annex 3.4. The manual has only some of the transitions
-between them; the README lists the assumptions for the others.
+between them; the README lists the assumptions for the others. What only real boxes show
+is from abl_field.md (its tags in brackets); what no source settles is an attribute.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
-from .abl_frames import NO_CURRENT, amps_of, duty_of
+from .abl_frames import (
+    LOWEST_DUTY,
+    LOWEST_PILOT,
+    NO_CURRENT,
+    SIX_AMPS,
+    amps_of,
+    duty_of,
+)
 
 if TYPE_CHECKING:
     from .car import Car
@@ -16,6 +24,7 @@ if TYPE_CHECKING:
 CONNECTED = frozenset({"B1", "B2", "C2", "C3", "C4"})
 CHARGING = frozenset({"C2", "C3", "C4"})
 UNREADABLE = 0x3E8
+AboveDefault = Literal["clipped", "unchanged", "stored", "refused"]
 LOAD_IMBALANCE_DETECTION = 0x3838
 # After a meter loss 10 A (annex 3.1, LCM); assumed for BC3 to BC6.
 REDUCED_CURRENT = 10.0
@@ -51,8 +60,16 @@ class Outlet:
         self.car = car
         self.default_current = default_current
         self.cable_current = cable_current
+        # Boxes of 16 A report 10B, not the 10A of the manual's rounding [trace].
         self.default_duty: int | None = None
+        # Rated current, w1 of 0x0F; None: Idefault.
+        self.rated_duty: int | None = None
         self.meter = meter
+        # Bit 5 of 0x02; also set on boxes whose meter reports nothing [same box not
+        # certain]. None: as the meter.
+        self.meter_bit: bool | None = None
+        # The floor of the meter on idle phases, 0.1 A [trace: 1]; 0 by the manual.
+        self.idle_floor = 0
         self.enable_input = enable_input
         self.en1 = True
         self.en2 = False
@@ -72,7 +89,28 @@ class Outlet:
         self.e0_after_pause: float | None = None
         self.ignore_limit = False
         self.shows_c3 = False
+        # Time from a write of 0x14 to word 3 of 0x0F, and to Ic and the pilot, s: in no
+        # trace; programs that read 10 to 30 s later do not complain [inferred].
+        self.icmax_delay = 0.0
+        self.ic_delay = 0.0
+        # A pause as 0x3E8 in the Ic of 0x2E: no box is known to report it there.
+        self.pause_in_ic = False
+        # A code above Idefault: "internally limited" [manual]; "current stays as it was"
+        # [trace]; refused, or stored as written: unknown.
+        self.above_default: AboveDefault = "clipped"
+        # Codes 50 to 79: refused [manual], or a 5 % pilot [notes].
+        self.low_codes_taken = False
+        # "Ic does show the lower one in E0" [notes]; nothing else is known.
+        self.e0_keeps_icmax = True
+        # A car that follows a pause late keeps the box in C; no trace. Without a car's
+        # doing the contactor opens after this time, s.
+        self.pause_forced_after: float | None = None
+        # Word 4 of 0x0F: what is offered, but once 0 with Icmax 14 A [dump].
+        self.offered_reads_zero = False
+        self.five_percent = 0
         self.icmax = self.default
+        self.icmax_shown = self.icmax
+        self._effects: list[tuple[float, str, int]] = []
         self.state = "A1"
         self._since = 0.0
         self._last_contact = 0.0
@@ -90,20 +128,23 @@ class Outlet:
 
     @property
     def ic(self) -> int:
-        """Return Ic as a duty cycle: the lowest of Icmax, Idefault, Ics (annex 3.3)."""
-        if self.icmax == NO_CURRENT:
+        """Return Ic as 0x2E reports it: the lowest of Icmax, Idefault, Ics (annex 3.3).
+
+        Compared as numbers: a pause (0x3E8) lowers nothing [trace: A1 215, B2 10B].
+        """
+        if self.pause_in_ic and self.icmax == NO_CURRENT:
             return NO_CURRENT
         candidates = [self.icmax, self.default]
         if self.cable_current is not None:
             candidates.append(duty_of(self.cable_current))
         if self.reduced:
             candidates.append(duty_of(REDUCED_CURRENT))
-        return min(candidates, key=amps_of)
+        return min(candidates)
 
     @property
     def ic_amps(self) -> float:
         """Return the current the car may draw per phase, A."""
-        return amps_of(self.ic)
+        return 0.0 if self.icmax == NO_CURRENT else amps_of(self.ic)
 
     @property
     def reduced(self) -> bool:
@@ -151,12 +192,53 @@ class Outlet:
 
     def set_by_other_master(self, amps: float) -> None:
         """Set Icmax as another master would (A; 0 = no current allowed)."""
-        self.icmax = duty_of(amps)
+        self.icmax = self.icmax_shown = duty_of(amps)
+
+    def write_icmax(self, code: int, now: float) -> bool:
+        """Take a write of 0x14; False: refused."""
+        taken = self._icmax_for(code)
+        if taken is None:
+            return False
+        if not self.ignore_limit:
+            self._effects += [
+                (now + self.icmax_delay, "icmax_shown", taken),
+                (now + self.ic_delay, "icmax", taken),
+            ]
+            self._take_effect(now)
+        return True
+
+    def _icmax_for(self, code: int) -> int | None:
+        """Return the Icmax that a written code leads to; None: refused."""
+        if code == NO_CURRENT:
+            return code
+        if code > NO_CURRENT:
+            return None
+        if code < LOWEST_DUTY:
+            if not self.low_codes_taken or code < LOWEST_PILOT:
+                return None
+            self.five_percent += 1
+            return code
+        if code <= self.default:
+            return max(code, SIX_AMPS)
+        return {
+            "refused": None,
+            "unchanged": self.icmax,
+            "stored": code,
+            "clipped": self.default,
+        }[self.above_default]
+
+    def _take_effect(self, now: float) -> None:
+        due = [effect for effect in self._effects if effect[0] <= now]
+        self._effects = [effect for effect in self._effects if effect[0] > now]
+        for _, name, code in due:
+            setattr(self, name, code)
 
     def go(self, state: str) -> None:
         """Change the state."""
         if state != self.state:
             self.state = state
+            if state == "E0" and not self.e0_keeps_icmax:
+                self._forget_icmax()
             self._since = self._now
             self._recovers_at = None
 
@@ -183,13 +265,17 @@ class Outlet:
     def restart(self, now: float) -> None:
         """Start as after a power cycle: Icmax is Idefault again."""
         self._now = now
-        self.icmax = self.default
+        self._forget_icmax()
         self.upstream_lost = False
         self._last_contact = now
         self._over = 0
         plugged = self.car is not None and self.car.plugged
         self.b1_b2_enabled = not (self.b2_needs_enable_after_power and plugged)
         self.go("A1")
+
+    def _forget_icmax(self) -> None:
+        self._effects = []
+        self.icmax = self.icmax_shown = self.default
 
     def contact(self, now: float) -> None:
         """Take note of a request, for the upstream time-out."""
@@ -201,6 +287,7 @@ class Outlet:
     def step(self, now: float) -> None:
         """Advance to this time."""
         self._now = now
+        self._take_effect(now)
         self._watch_upstream(now)
         if self.enable_input == 2 and not self.en1 and self.state[0] in "ABC":
             self.go("E0")
@@ -239,7 +326,13 @@ class Outlet:
                 self.go("B2")
         elif state in CONNECTED:
             wants = self.car is not None and self.car.accepts(self.ic_amps)
+            wants = wants and not self._pause_is_forced(now)
             self.go(self._charging_state() if wants else "B2")
+
+    def _pause_is_forced(self, now: float) -> bool:
+        if self.pause_forced_after is None or self._paused_at is None:
+            return False
+        return now - self._paused_at >= self.pause_forced_after
 
     def _charging_state(self) -> str:
         if self.imbalance:
@@ -266,9 +359,14 @@ class Outlet:
             self.go("F9")
 
     def _watch_pause(self, now: float) -> None:
-        if self.icmax != NO_CURRENT or self.e0_after_pause is None:
+        if self.icmax != NO_CURRENT:
             self._paused_at = None
         elif self._paused_at is None:
             self._paused_at = now
-        elif now - self._paused_at >= self.e0_after_pause and self.state[0] in "ABC":
+        elif (
+            self.e0_after_pause is not None
+            and now - self._paused_at >= self.e0_after_pause
+            and self.state[0] in "ABC"
+        ):
+            # By itself, mainly after long pauses [told]; the time is unknown.
             self.go("E0")

@@ -30,7 +30,8 @@ def words(*values: int) -> bytes:
 def identity(box: AblBox) -> bytes:
     """0x01: hardware, device-ID, firmware, configuration."""
     out = box.outlet
-    flags = box.coding_resistor << 7 | out.upstream_enabled << 6 | out.meter << 5
+    meter = out.meter if out.meter_bit is None else out.meter_bit
+    flags = box.coding_resistor << 7 | out.upstream_enabled << 6 | meter << 5
     flags |= box.rdc_md << 4 | box.coding_resistor << 3
     flags |= box.welding_detection << 2 | out.enable_input
     major, minor = box.firmware
@@ -65,9 +66,17 @@ def flags(box: AblBox) -> bytes:
     return bytes((state_byte(out.state),)) + words(bits)
 
 
-def settings(box: AblBox) -> bytes:
-    """0x0F: the fourth word holds Icmax; not in the manual."""
-    return bytes((state_byte(box.state),)) + words(0, 0, box.outlet.icmax, 0)
+def icmax(box: AblBox) -> bytes:
+    """0x0F: rated, Idefault, Icmax as written, offered (abl_field.md); not in the manual.
+
+    The byte is 3F in all five public frames, its meaning unknown.
+    """
+    out = box.outlet
+    rated = out.default if out.rated_duty is None else out.rated_duty
+    offered = 0 if out.offered_reads_zero else out.ic
+    return bytes((box.icmax_byte,)) + words(
+        rated, out.default, out.icmax_shown, offered
+    )
 
 
 def currents(box: AblBox) -> tuple[int, int, int]:
@@ -77,7 +86,8 @@ def currents(box: AblBox) -> tuple[int, int, int]:
     if hidden or (out.state == "B2" and box.unreadable_in_b2):
         return (UNREADABLE,) * 3
     one, two, three = (
-        min(METER_LIMIT, round(current * 10)) for current in out.phase_currents
+        max(out.idle_floor, min(METER_LIMIT, round(current * 10)))
+        for current in out.phase_currents
     )
     return (three, two, one) if box.l3_first else (one, two, three)
 
@@ -111,9 +121,9 @@ BLOCKS: dict[int, tuple[int, Callable[[AblBox], bytes]]] = {
     0x33: (3, short),
     0x50: (8, serial),
 }
-# Not in the manual; seen in the field.
+# Not in the manual; seen in the field. 0x0F: exactly five registers.
+ICMAX_BLOCK: dict[int, tuple[int, Callable[[AblBox], bytes]]] = {0x0F: (5, icmax)}
 EXTRA_BLOCKS: dict[int, tuple[int, Callable[[AblBox], bytes]]] = {
-    0x04: (1, short_state),
-    0x0F: (5, settings),
+    0x04: (1, short_state)
 }
 BROADCAST_READS = frozenset({0x01})

@@ -134,9 +134,15 @@ def _abl(options: argparse.Namespace) -> list[Device]:
             upstream_timeout=options.upstream_timeout or 30.0,
             sleep_after=options.sleep,
             extra_registers=options.extra_registers,
+            tells_icmax=not options.no_icmax,
             turn_round=options.turn_round,
         )
-        box.l3_first = options.l3_first
+        box.l3_first = not options.l1_first
+        box.outlet.default_duty = options.default_duty
+        box.outlet.idle_floor = options.idle_floor
+        box.outlet.icmax_delay = box.outlet.ic_delay = options.effect_delay
+        box.outlet.e0_after_pause = options.e0_after_pause
+        box.lost_asleep_each = options.lost_asleep
         boxes.append(box)
     return boxes
 
@@ -222,10 +228,32 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--extra-registers",
         action="store_true",
-        help="registers 0x04 and 0x0F can be read too",
+        help="register 0x04 can be read too",
     )
+    add("--no-icmax", action="store_true", help="register 0x0F is not answered")
+    add(
+        "--default-duty",
+        type=lambda text: int(text, 0),
+        metavar="CODE",
+        help="Idefault as boxes report it: 0x10B on those of 16 A",
+    )
+    add("--idle-floor", type=int, default=0, metavar="N", help="0.1 A on idle phases")
+    add(
+        "--effect-delay",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="time from a write of a limit or a pause to its effect",
+    )
+    add(
+        "--e0-after-pause",
+        type=float,
+        metavar="S",
+        help="goes to E0 by itself after a pause of S seconds",
+    )
+    add("--lost-asleep", type=int, default=1, metavar="N", help="requests lost asleep")
     add("--turn-round", type=float, default=0.002, metavar="S")
-    add("--l3-first", action="store_true", help="phase order L3, L2, L1")
+    add("--l1-first", action="store_true", help="L1 in the first word, not the third")
     evbox = kinds.add_parser("evbox", help="EVBox ChargePoints (Protocol Max v4)")
     _common(evbox.add_argument)
     add = evbox.add_argument

@@ -18,6 +18,7 @@ READ_FULL = b":0103002E0005C9\r\n"
 SET_10_A = b":0110001400010200A632\r\n"
 SET_OK = b">011000140001DA\r\n"
 FAILED = b">0190046B\r\n"
+READ_ICMAX = b":0103000F0005E8\r\n"
 SILENT = 0.03
 
 
@@ -39,6 +40,10 @@ def read(register: int, count: int, box: int = 1) -> bytes:
 
 def duty(answer: bytes) -> int:
     return int(answer[11:15], 16) & 0x0FFF
+
+
+def icmax(answer: bytes) -> int:
+    return int(answer[19:23], 16)
 
 
 def state(answer: bytes) -> bytes:
@@ -87,7 +92,9 @@ def test_answers_of_real_boxes() -> None:
         read(0x14, 1),  # 0x14 cannot be read back
         read(0x14, 5),
         read(0x2E, 3),  # not the whole block
-        read(0x0F, 5),  # not in the manual: off by default
+        read(0x04, 1),  # not in the manual: off by default
+        read(0x0F, 4),  # exactly five registers
+        read(0x0F, 6),
         read(0x99, 1),
         write(0x13, 0x10B),
         line(":", bytes.fromhex("0106001400A6")),  # function 6
@@ -128,8 +135,10 @@ def test_ic_is_the_lowest() -> None:
         assert duty(client.ask(READ_FULL)) == duty_of(10)
         client.ask(write(0x14, duty_of(32)))
         assert duty(client.ask(READ_FULL)) == duty_of(13)
+        # A pause lowers nothing.
         client.ask(write(0x14, 0x3E8))
-        assert duty(client.ask(READ_FULL)) == 0x3E8
+        assert duty(client.ask(READ_FULL)) == duty_of(13)
+        assert box.ic_amps == 0
 
 
 def test_broadcast() -> None:
@@ -158,16 +167,16 @@ def test_a_car_charges_pauses_and_leaves() -> None:
         bus.advance(10)
         answer = client.ask(READ_FULL)
         assert state(answer) == b"C2"
-        assert answer[11:].startswith(b"910A007800780000")
-        assert client.ask(b":010300330003C6\r\n").startswith(b">0103063380C20C0C00")
+        assert answer[11:].startswith(b"910A000000780078")
+        assert client.ask(b":010300330003C6\r\n").startswith(b">0103063380C2000C0C")
         client.ask(SET_10_A)
         bus.advance(10)
-        assert client.ask(READ_FULL)[11:].startswith(b"90A6006400640000")
+        assert client.ask(READ_FULL)[11:].startswith(b"90A6000000640064")
         client.ask(write(0x14, 0x3E8))
         bus.advance(10)
         answer = client.ask(READ_FULL)
         assert state(answer) == b"B2"
-        assert answer[11:].startswith(b"93E8000000000000")
+        assert answer[11:].startswith(b"910A000000000000")
         car.leave()
         assert state(client.ask(READ_FULL)) == b"A1"
 
@@ -359,10 +368,11 @@ def test_defects() -> None:
         box.answer_register = 0x33
         assert client.ask(READ_FULL).startswith(b">01030A33A1")
         box.answer_register = None
-        box.l3_first = True
         car.plug_in()
         bus.advance(10)
         assert client.ask(READ_FULL)[15:27] == b"0000" * 2 + b"00A0"
+        box.l3_first = False
+        assert client.ask(READ_FULL)[15:27] == b"00A0" + b"0000" * 2
         box.stop_locally()
         assert state(client.ask(READ_FULL)) == b"E0"
         box.start_locally()
@@ -374,9 +384,165 @@ def test_extra_registers() -> None:
     box = AblBox(1, extra_registers=True)
     with line_to(box) as (_, client):
         assert client.ask(read(0x04, 1)) == b">01030204A155\r\n"
+
+
+def test_a_box_that_does_not_report_icmax() -> None:
+    with line_to(AblBox(1, tells_icmax=False)) as (_, client):
+        assert client.ask(READ_ICMAX, timeout=SILENT) == b""
+
+
+def box_of(default: int, **settings: object) -> AblBox:
+    """Return a box that reports this Idefault."""
+    box = AblBox(1, **settings)  # type: ignore[arg-type]
+    box.outlet.default_duty = default
+    box.outlet.icmax = box.outlet.icmax_shown = default
+    return box
+
+
+def test_a_paused_box_of_32_a_in_a1() -> None:
+    # T1, 09:29 [trace]: both frames in one minute.
+    box = box_of(0x215)
+    with line_to(box) as (_, client):
+        client.ask(write(0x14, 0x3E8))
+        assert client.ask(READ_ICMAX) == b">01030A0F3F0215021503E8021574\r\n"
+        assert client.ask(READ_FULL) == b">01030A2EA1121503E803E803E83B\r\n"
+
+
+def test_a_paused_box_of_16_a_in_b2() -> None:
+    # T2, 17:32 [trace]: the pause was written twice.
+    car = Car()
+    box = box_of(0x10B, car=car)
+    box.unreadable_in_b2 = True
+    with line_to(box) as (bus, client):
+        car.plug_in()
+        for _ in range(2):
+            assert client.ask(b":0110001400010203E8ED\r\n") == SET_OK
+        bus.advance(10)
+        assert client.ask(READ_FULL) == b">01030A2EB2910B03E803E803E8B5\r\n"
+
+
+@pytest.mark.parametrize(
+    ("default", "written", "zero", "answer"),
+    [
+        # K [dump], and w4 = 0 on the same box.
+        (0x10B, 0xE9, False, b">01030A0F3F010B010B00E900E9BA\r\n"),
+        (0x10B, 0xE9, True, b">01030A0F3F010B010B00E90000A3\r\n"),
+        (0x85, None, False, b">01030A0F3F010B00850085008509\r\n"),
+        (0x85, 0x64, False, b">01030A0F3F010B0085006400644B\r\n"),
+    ],
+)
+def test_icmax_of_real_boxes(
+    default: int,
+    written: int | None,
+    zero: bool,  # noqa: FBT001
+    answer: bytes,
+) -> None:
+    box = box_of(default)
+    box.outlet.rated_duty = 0x10B
+    box.outlet.offered_reads_zero = zero
+    with line_to(box) as (_, client):
+        if written is not None:
+            client.ask(write(0x14, written))
+        assert client.ask(READ_ICMAX) == answer
+
+
+@pytest.mark.parametrize(
+    ("default", "written", "answer"),
+    [
+        (0x10B, None, b">01030A2EA1110B03E803E803E846\r\n"),  # T3 [trace]
+        (0x85, None, b">01030A2EA1108503E803E803E8CD\r\n"),  # K [dump]
+        (0x10B, 0x64, b">01030A2EA1106403E803E803E8EE\r\n"),  # K [dump]
+    ],
+)
+def test_a_limit_shows_in_a1(default: int, written: int | None, answer: bytes) -> None:
+    box = box_of(default)
+    with line_to(box) as (_, client):
+        if written is not None:
+            client.ask(write(0x14, written))
+        assert client.ask(READ_FULL) == answer
+
+
+def test_charging_with_and_without_a_meter() -> None:
+    car = Car(max_current=15.1, phases=1)
+    box = box_of(0x10B, car=car)
+    box.outlet.idle_floor = 1
+    with line_to(box) as (bus, client):
+        client.ask(write(0x14, 0x10A))
+        car.plug_in()
+        bus.advance(30)
+        # T4 [trace]: the load stands in the third word.
+        assert client.ask(READ_FULL) == b">01030A2EC2910A000100010097CE\r\n"
+        box.outlet.meter = False
+        client.ask(write(0x14, 0x10B))
+        # K [dump].
+        assert client.ask(READ_FULL) == b">01030A2EC2910B03E803E803E8A5\r\n"
+
+
+def test_a_limit_is_kept_in_e0() -> None:
+    box = box_of(0x10B)
+    box.outlet.meter = False
+    with line_to(box) as (_, client):
+        client.ask(write(0x14, 0x64))
+        assert client.ask(b":01100005000102E0E027\r\n") == b">011000050001E9\r\n"
+        assert client.ask(READ_FULL) == b">01030A2EE0106403E803E803E8AF\r\n"
+
+
+def test_time_to_take_effect() -> None:
+    box = box_of(0x10B)
+    box.outlet.icmax_delay, box.outlet.ic_delay = 2.0, 4.0
+    with line_to(box) as (bus, client):
+        assert client.ask(SET_10_A) == SET_OK
+        assert icmax(client.ask(READ_ICMAX)) == duty(client.ask(READ_FULL)) == 0x10B
+        bus.advance(3)
+        assert icmax(client.ask(READ_ICMAX)) == 0xA6
+        assert duty(client.ask(READ_FULL)) == 0x10B
+        bus.advance(2)
+        assert duty(client.ask(READ_FULL)) == 0xA6
+
+
+@pytest.mark.parametrize(
+    ("behaviour", "answer", "shown"),
+    [
+        ("clipped", SET_OK, 0x10B),
+        ("unchanged", SET_OK, 0xA6),
+        ("stored", SET_OK, 0x215),
+        ("refused", FAILED, 0xA6),
+    ],
+)
+def test_a_code_above_idefault(behaviour: str, answer: bytes, shown: int) -> None:
+    # 32 A to a box of 16 A is answered, the current stays [trace]; all else is unknown.
+    box = box_of(0x10B)
+    box.outlet.above_default = behaviour  # type: ignore[assignment]
+    with line_to(box) as (_, client):
         client.ask(SET_10_A)
-        data = bytes.fromhex(client.ask(read(0x0F, 5))[7:-4].decode())
-        assert int.from_bytes(data[6:8], "big") & 0x0FFF == 166
+        assert client.ask(b":011000140001020215C1\r\n") == answer
+        assert icmax(client.ask(READ_ICMAX)) == shown
+        assert duty(client.ask(READ_FULL)) <= 0x10B
+
+
+def test_codes_that_give_a_pilot_of_5_percent() -> None:
+    box = AblBox(1)
+    box.outlet.low_codes_taken = True
+    with line_to(box) as (_, client):
+        assert client.ask(write(0x14, 49)) == FAILED
+        assert client.ask(write(0x14, 50)) == SET_OK
+        assert box.outlet.five_percent == 1
+        assert box.ic_amps == 0
+        # 80 to 99 are taken as 100.
+        assert client.ask(write(0x14, 80)) == SET_OK
+        assert icmax(client.ask(READ_ICMAX)) == 100
+
+
+def test_several_requests_lost_asleep_and_stray_bytes_after_it() -> None:
+    box = AblBox(1, sleep_after=20, wake_time=0.01)
+    box.lost_asleep_each = 3
+    box.stray = b"\xff\x00"
+    with line_to(box) as (bus, client):
+        for _ in range(2):
+            for _ in range(3):
+                assert client.ask(READ_FULL, timeout=0.05) == b""
+            assert client.ask(READ_FULL).endswith(b"\r\n")
+            bus.advance(21)
 
 
 def test_the_log_is_an_oracle() -> None:

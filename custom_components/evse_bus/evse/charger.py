@@ -39,6 +39,7 @@ from .model import (
     Limits,
     OrderChange,
     Orders,
+    OrderState,
     PauseReason,
     Persistence,
     Range,
@@ -181,6 +182,14 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         return self._reason[1]
 
     @property
+    def order_state(self) -> OrderState | None:
+        """Return what its registers prove about the order that stands.
+
+        ``None``: not known, or its protocol cannot read it back.
+        """
+        return None
+
+    @property
     def fail_safe(self) -> FailSafe | None:
         """Return what it does when no message comes; ``None``: not known yet."""
         return FailSafe.NOTHING
@@ -200,6 +209,7 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
             self.info,
             self.waits_for_current,
             self.pause_reason,
+            self.order_state,
         )
 
     @property
@@ -385,6 +395,15 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         self.updated()
         if changed:
             await self._store(confirmed)
+
+    async def remember(self, name: str, value: str | None) -> None:
+        """Store a note of the protocol with the orders; ``None`` deletes it."""
+        if self.orders.remembered.get(name) == value:
+            return
+        notes = {**self.orders.remembered, name: value}
+        kept = {key: note for key, note in notes.items() if note is not None}
+        self.orders = replace(self.orders, remembered=kept)
+        await self._store(self.orders)
 
     async def _store(self, orders: Orders) -> None:
         try:

@@ -6,6 +6,7 @@ no value is made up for what is not on the wire, and 0 is always a measured 0.
 This module imports nothing of the project and nothing of Home Assistant.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from typing import ClassVar
@@ -115,6 +116,19 @@ class PauseReason(StrEnum):
     """It was stopped because it offered more than its limit."""
 
 
+class OrderState(StrEnum):
+    """What a charger's registers prove about the order that stands."""
+
+    CONFIRMED = "confirmed"
+    NOT_READ_BACK = "not_read_back"
+    """Sent or stored; no register shows it (yet)."""
+    NOT_TAKEN = "not_taken"
+    """Sent again and again, and not followed."""
+    LOWER_THAN_ORDERED = "lower_than_ordered"
+    PAUSED_ELSEWHERE = "paused_elsewhere"
+    """Paused, not by us: only the user's permission ends it."""
+
+
 class Capability(StrEnum):
     """A feature of a charger; an entity exists only for a capability."""
 
@@ -130,6 +144,7 @@ class Capability(StrEnum):
     ESTIMATED_POWER = "estimated_power"
     ESTIMATED_ENERGY = "estimated_energy"
     OFFERED_CURRENT = "offered_current"
+    ORDER_STATE = "order_state"
     MAXIMUM_CURRENT = "maximum_current"
     MINIMUM_CURRENT = "minimum_current"
     FAULTS = "faults"
@@ -287,6 +302,8 @@ class Orders:
     """Limit that the charger falls back to without messages; any value from 0."""
     fail_safe_timeout: int = 60
     """Time without messages after which it falls back, s (EVBox only)."""
+    remembered: Mapping[str, str] = field(default_factory=dict)
+    """What the protocol has to know after a restart, by its own names."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

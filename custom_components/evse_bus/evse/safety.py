@@ -193,6 +193,7 @@ def cautious(old: Orders, new: Orders) -> Orders:
         limit=_lower_limit(old.limit, new.limit),
         fail_safe=_lower_limit(old.fail_safe, new.fail_safe),
         fail_safe_timeout=old.fail_safe_timeout,
+        remembered=old.remembered,
     )
 
 
@@ -220,4 +221,5 @@ def expired(orders: Orders) -> Orders:
         limit=orders.fail_safe,
         fail_safe=orders.fail_safe,
         fail_safe_timeout=orders.fail_safe_timeout,
+        remembered=orders.remembered,
     )

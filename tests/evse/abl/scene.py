@@ -94,8 +94,6 @@ class Scene:
     async def settled(self, settings: AblConfig, wanted: Orders) -> AblCharger:
         """Put a charger on the bus; return after its first exchanges."""
         charger = self.add(settings, wanted)
-        # No probe of the register that most boxes lack: its time-out takes long.
-        charger.has_icmax = False
         await until(lambda: charger.available and charger.info is not None)
         await self.polled(charger)
         return charger

@@ -75,7 +75,7 @@ async def test_after_a_lost_reply_the_state_decides() -> None:
         charger = await scene.settled(config(), orders())
         await scene.stop_polls(charger)
         # The status, and the reply to the write.
-        answers(box, "good", "lose")
+        answers(box, "good", "good", "lose")
         await charger.command(Command.SET_OUTLET, value=False)
         assert box.state == "E0"
         assert scene.writes() == [E0]
@@ -210,7 +210,7 @@ async def test_a_car_is_woken_though_replies_are_lost() -> None:
         await until(lambda: box.state == "B2")
         await scene.stop_polls(charger)
         # The status, E0, the status (E0 was taken), the status again, A1.
-        answers(box, "good", "lose", "good", "good", "lose")
+        answers(box, "good", "good", "lose", *["good"] * 4, "lose")
         await charger.command(Command.WAKE)
         assert scene.writes() == [E0, A1]
         assert box.state != "E0"
@@ -289,7 +289,7 @@ async def test_a_reset_clears_a_failure() -> None:
         box.fail(3)
         await until(lambda: Fault.DC_RESIDUAL_CURRENT in charger.faults)
         await scene.stop_polls(charger)
-        answers(box, "good", "lose")
+        answers(box, "good", "good", "lose")
         # The reply is lost; the state shows that the reset happened.
         await charger.command(Command.RESET)
         assert box.resets == 1
@@ -301,7 +301,7 @@ async def test_a_reset_whose_reply_is_lost_is_not_repeated() -> None:
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders())
         await scene.stop_polls(charger)
-        answers(box, "good", "lose")
+        answers(box, "good", "good", "lose")
         with pytest.raises(NotConfirmedError, match="not repeated"):
             await charger.command(Command.RESET)
         assert box.resets == 1

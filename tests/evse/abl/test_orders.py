@@ -18,11 +18,12 @@ from custom_components.evse_bus.evse.errors import (
 from custom_components.evse_bus.evse.model import (
     Fault,
     OrderChange,
-    Orders,
+    OrderState,
     PauseReason,
     Status,
 )
-from tests.virtual import AblBox, Car
+from tests.simulated_time import simulate
+from tests.virtual import AblBox, Car, Request
 
 from .scene import LIMIT, Scene, config, orders, until
 
@@ -161,7 +162,7 @@ async def test_after_a_power_cycle_the_limit_is_reasserted_at_once() -> None:
         # No other exchange between the status above the limit and the write.
         registers = [one.register for one in scene.requests() if one.device_id == 1]
         second = len(registers) - 1 - registers[::-1].index(LIMIT)
-        assert registers[second - 1 : second + 2] == [0x2E, LIMIT, 0x2E]
+        assert registers[second - 1 : second + 3] == [0x0F, LIMIT, 0x2E, 0x0F]
 
 
 async def test_after_a_power_cycle_a_pause_is_reasserted_too() -> None:
@@ -231,16 +232,34 @@ async def test_a_box_that_refuses() -> None:
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders())
         await scene.stop_polls(charger)
-        box.faults.once("replace", b">0190046B\r\n")
+        answer = box._answer
+
+        def refuse(request: Request) -> bytes | None:
+            return b">0190046B\r\n" if request.value == PAUSE else answer(request)
+
+        box._answer = refuse  # type: ignore[method-assign]
         with pytest.raises(ExchangeRefusedError, match="exception 4") as caught:
             await charger.change_orders(OFF)
         assert caught.value.code == 4
         assert charger.statistics.refused == 1
         assert Fault.LIMIT_NOT_TAKEN in charger.faults
+        assert scene.writes() == [PAUSE] * 3
         # The pause stands, and is written again.
+        box._answer = answer  # type: ignore[method-assign]
         scene.resume_polls(charger)
-        await until(lambda: Fault.LIMIT_NOT_TAKEN not in charger.faults)
+        await until(lambda: Fault.LIMIT_NOT_TAKEN not in charger.faults, 20)
         assert box.ic_amps == 0
+
+
+async def test_a_pause_refused_once_is_repeated() -> None:
+    box = AblBox(1)
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders())
+        await scene.stop_polls(charger)
+        box.faults.once("replace", b">0190046B\r\n")
+        await charger.change_orders(OFF)
+        assert scene.writes()[0] == PAUSE
+        assert charger.order_state is OrderState.CONFIRMED
 
 
 async def test_after_lost_and_late_replies_a_pause_is_repeated() -> None:
@@ -285,9 +304,8 @@ async def test_a_pause_is_never_merged_away() -> None:
         assert not isinstance(results[4], BaseException)
         assert scene.writes()[0] == PAUSE
         assert set(scene.writes()) == {PAUSE}
-        assert charger.orders == Orders(
-            limit=limit(11).apply(orders()).limit, allowed=False
-        )
+        assert charger.orders.limit == limit(11).apply(orders()).limit
+        assert charger.orders.allowed is False
 
 
 async def test_a_pause_during_a_start() -> None:
@@ -435,4 +453,4 @@ def test_no_sequence_of_changes_starts_a_car_stopped_by_the_switch(
                     assert box.ic_amps == 0
                 assert charger.orders.allowed is allowed
 
-    asyncio.run(scene_of())
+    simulate(scene_of())

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from hypothesis import given, strategies as st
 import pytest
 
+from custom_components.evse_bus.evse.abl.decisions import Evidence, Standing, decide
 from custom_components.evse_bus.evse.abl.readings import (
     EnergyEstimate,
     Snapshot,
@@ -62,7 +63,17 @@ def snapshot(
         plugged=plugged,
     )
     info = WITH_METER if meter else WITHOUT_METER
-    return Snapshot(reading=reading, info=info, flags=flags)
+    known = decide(
+        Evidence(state=state, ic=duty, reports_icmax=True, icmax=duty),
+        Standing(code=duty),
+    )
+    return Snapshot(
+        reading=reading,
+        info=info,
+        flags=flags,
+        paused=known.paused,
+        offered=known.offered,
+    )
 
 
 def read(box: Snapshot) -> tuple[ChargerReading, ConnectorReading]:
@@ -148,6 +159,14 @@ def test_a_missing_current_is_zero_where_the_contactor_is_open(state: int) -> No
 )
 def test_a_missing_current_is_unknown_elsewhere(box: Snapshot) -> None:
     assert read(box)[1].current == UNKNOWN_PHASES
+
+
+def test_the_floor_of_the_meter_is_no_current() -> None:
+    # Seen on idle phases, and in B2 on all three.
+    _, connector = read(snapshot(currents=(0.1, 0.1, 15.1)))
+    assert connector.current == (0, 0, 15.1)
+    _, connector = read(snapshot(0xB2, currents=(0.1, 0.1, 0.1)))
+    assert connector.current == (0, 0, 0)
 
 
 def test_phase_order() -> None:

@@ -16,7 +16,7 @@ from .scan import scan
 
 _PHASE_ORDER: Final = Choice(
     name="phase_order",
-    default="123",
+    default="321",
     values={"".join(map(str, one)): [*one] for one in permutations((1, 2, 3))},
     value=tuple,
 )

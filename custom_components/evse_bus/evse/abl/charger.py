@@ -1,8 +1,8 @@
 """One ABL wallbox (EVCC2/3): its orders, and when they are sent.
 
 The status is read before anything is written. A limit above the orders is written
-again (Icmax does not survive a power cycle); permission is never given without the
-user (PROTOCOLS.md, 2).
+again (Icmax does not survive a power cycle), by the rules of `decisions`; permission
+is never given without the user (PROTOCOLS.md, 2).
 """
 
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from functools import partial
 from typing import Final, override
 
 from ..conversation import Conversation, FollowUp
-from ..errors import GarbledReplyError, NotAvailableError
+from ..errors import GarbledReplyError, NotAvailableError, ReplyTimeoutError
 from ..exchange import Turn
 from ..model import (
     Capability,
@@ -20,14 +20,16 @@ from ..model import (
     Limits,
     OrderChange,
     Orders,
+    OrderState,
 )
-from ..safety import Setpoint, clamp
+from ..safety import clamp
 from .commands import conversation_for
 from .config import AblConfig
-from .duty import PAUSE, is_within
-from .reader import AblReader
+from .decisions import FAILED_AFTER, WRITE_PAUSES, Decision, believed_paused
+from .duty import PAUSE
+from .reader import ICMAX_PROBES, AblReader
 from .registers import Reading, limit_duty
-from .states import E0, SETUP
+from .states import E0, SETUP, is_failure
 from .steps import restore
 
 GARBLED_REPLIES: Final = 3
@@ -40,6 +42,7 @@ _CAPABILITIES: Final = frozenset(
         Capability.PLUGGED,
         Capability.CHARGING,
         Capability.OFFERED_CURRENT,
+        Capability.ORDER_STATE,
         Capability.FAULTS,
         Capability.UPSTREAM_TIMEOUT,
         Capability.ENABLE_AFTER_POWER_CYCLE,
@@ -69,8 +72,6 @@ class AblCharger(AblReader):
         super().__init__(config, orders)
         self._active: _ActiveCommand | None = None
         self._garbled = 0
-        self._paused_by_limit = False
-        """Our limit of 0 A has paused it, not the user."""
         self._fell_back = False
         """The fail-safe of expired orders has been applied."""
 
@@ -96,23 +97,19 @@ class AblCharger(AblReader):
     @property
     @override
     def limits(self) -> Limits:
-        return Limits(installation=self.config.installation_limit)
+        return Limits(
+            installation=self.config.installation_limit, reported=self.highest
+        )
 
     @property
     @override
     def waits_for_current(self) -> bool:
-        return self._paused_by_limit
+        return self.paused_by_our_limit
 
     @override
     def on_line_open(self) -> None:
         super().on_line_open()
         self._active = None
-
-    @override
-    def keep_status(self, status: Reading, now: float) -> None:
-        if status.duty != PAUSE:
-            self._paused_by_limit = False
-        super().keep_status(status, now)
 
     # -- The regular exchange ----------------------------------------------------
 
@@ -128,9 +125,9 @@ class AblCharger(AblReader):
             raise
         self._garbled = 0
         self.notice(Fault.DUPLICATE_ADDRESS, present=False)
-        return self._next_action(status)
+        return self._next_action(status, turn.now)
 
-    def _next_action(self, status: Reading) -> FollowUp | None:
+    def _next_action(self, status: Reading, now: float) -> FollowUp | None:
         """Return the conversation that a status requires."""
         if self.busy:
             return None
@@ -139,28 +136,29 @@ class AblCharger(AblReader):
                 restoring = partial(restore, self)
                 return FollowUp(self._exclusive("restoring its state", restoring))
             self.pending_cleanup = None
-        if self._must_reassert(status):
-            return FollowUp(self._reassert)
-        if self.has_icmax is None:
-            return FollowUp(self.probe_icmax)
-        return None
-
-    def _must_reassert(self, status: Reading) -> bool:
-        """Return whether the limit has to be written again; note one that is taken."""
-        if status.state in SETUP:
-            return False
-        duty = limit_duty(self.setpoint)
-        if not is_within(status.duty, duty):
-            return True
-        self.confirmed = duty
-        self.notice(Fault.LIMIT_NOT_TAKEN, present=False)
+        if (decision := self.decide(now)) is None:
+            return None
         if self.orders_expired and not self._fell_back:
             # The fail-safe may be above the limit: raised to it once, and never in a
             # box that is paused or disabled.
-            if status.duty < duty != PAUSE and status.state != E0:
-                return True
             self._fell_back = True
-        return False
+            self.raise_pending = decision.paused is not True and status.state != E0
+            decision = self.decide(now) or decision
+        self._note(decision)
+        if decision.write and now >= self.writes.due(self.code, now):
+            return FollowUp(self._reassert)
+        return None
+
+    def _note(self, decision: Decision) -> None:
+        """Note whether the box follows its order."""
+        if decision.ignored:
+            self.notice(Fault.LIMIT_NOT_TAKEN, present=True)
+        elif not decision.write and decision.state is not None:
+            self.notice(Fault.LIMIT_NOT_TAKEN, present=False)
+        if decision.state is OrderState.CONFIRMED:
+            if self.code != PAUSE:
+                self.confirmed = self.code
+            self.missed = False
 
     # -- Orders ------------------------------------------------------------------
 
@@ -168,67 +166,125 @@ class AblCharger(AblReader):
     async def apply(self, turn: Turn, orders: Orders, change: OrderChange) -> None:
         with self.conversing():
             await self.identify(turn)
-            setpoint = clamp(orders, self.limits)
-            # A pause by the user is sent at once; all else depends on the status.
-            if change.allowed is not False and not self._may_write(
-                await self.read_status(turn), setpoint, orders, change
-            ):
+            status = self.last_status
+            if change.allowed is not False or status is None or self.misses:
+                # A pause by the user waits for no other exchange.
+                status = await self.read_status(turn)
+                await self._require_icmax(turn, status)
+            if change.allowed is True:
+                self._require_startable(status)
+            if change.allowed is False:
+                await self.note_pause(by_limit=False)
+                self.allowed_by_user = False
+            paused = clamp(orders, self.limits).paused and orders.allowed is not False
+            if not self._may_write(status, turn.now, orders, change):
+                if paused and change.allowed is True:
+                    await self.note_pause(by_limit=True)
                 return
+            ends_own_pause = self.paused_by_our_limit
+            self.writes.restart(turn.now)
             await self.apply_setpoint(
                 turn,
                 lambda: clamp(self.order_to_send(change), self.limits),
-                starts=change.allowed is True,
+                starts=change.allowed is True or ends_own_pause,
             )
-            self._paused_by_limit = setpoint.paused and orders.allowed is not False
             self._fell_back = False
+            if change.allowed is True:
+                self.allowed_by_user = True
+                self.missed = False
+            await self.note_pause(by_limit=paused)
+
+    async def _require_icmax(self, turn: Turn, status: Reading) -> None:
+        """Raise ReplyTimeoutError for a box whose Icmax and maximum are not known yet.
+
+        A box that reports them is never sent more than its maximum, and a limit never
+        ends a pause.
+        """
+        for _ in range(ICMAX_PROBES):
+            if self.reports_icmax is False:
+                return
+            if self.highest is not None and self.evidence(status, turn.now).icmax:
+                return
+            await self.read_icmax(turn)
+        if self.reports_icmax is not False:
+            message = f"{self.config.name} does not answer a read of its Icmax"
+            raise ReplyTimeoutError(message)
+
+    def _require_startable(self, status: Reading) -> None:
+        """Raise NotAvailableError in a state in which charging cannot be allowed."""
+        if status.state in SETUP:
+            reason = "is in set-up mode"
+        elif is_failure(status.state):
+            reason = "reports a failure"
+        elif status.state == E0:
+            reason = "has its outlet disabled, enable it first"
+        else:
+            return
+        message = f"{self.config.name} {reason}"
+        raise NotAvailableError(message)
 
     def _may_write(
-        self, status: Reading, setpoint: Setpoint, orders: Orders, change: OrderChange
+        self, status: Reading, now: float, orders: Orders, change: OrderChange
     ) -> bool:
         """Return whether the set-point of a change is written in this status.
 
         False: the orders are only stored, and count when the box lets a car charge
-        again. A limit change never starts a car. Raises NotAvailableError where the
-        user starts one and the box cannot.
+        again. A limit change never starts a car. Raises NotAvailableError in set-up
+        mode.
         """
         if status.state in SETUP:
             message = f"{self.config.name} is in set-up mode"
             raise NotAvailableError(message)
+        if is_failure(status.state):
+            # Sent when the failure is over.
+            self.raise_pending = True
+            return False
+        code = limit_duty(clamp(orders, self.limits))
+        seen = self.evidence(status, now)
+        paused = believed_paused(seen)
+        if code == PAUSE:
+            return paused is not True or not self.writes.settled(code, now)
         if change.allowed is True:
-            if status.state == E0:
-                message = f"{self.config.name}: the outlet is disabled, enable it first"
-                raise NotAvailableError(message)
             return True
-        duty = limit_duty(setpoint)
-        lowers = not is_within(status.duty, duty)
-        if setpoint.paused or status.duty == duty:
-            return lowers
         changes_limit = change.current is not None or any(
             phase is not None for phase in change.phases
         )
-        if status.duty == PAUSE:
-            # A limit ends only the pause that our own limit has brought about.
-            by_limit = changes_limit and self._paused_by_limit
-            return by_limit and orders.allowed is not False
-        if status.state == E0:
-            return lowers
-        return lowers or changes_limit or self._fell_back
+        if paused is True or (paused is None and self.setpoint.paused):
+            # A limit ends only the pause of our own limit of 0 A.
+            writes = (
+                changes_limit
+                and self.paused_by_our_limit
+                and orders.allowed is not False
+            )
+        elif paused is None:
+            # Perhaps paused by another, but not in C.
+            writes = not seen.idle and seen.ic != code
+        else:
+            raises = seen.icmax is not None and seen.icmax < code
+            writes = seen.icmax != code and not (
+                raises
+                and (status.state == E0 or not (changes_limit or self._fell_back))
+            )
+        self.raise_pending = changes_limit and not writes
+        return writes
 
     async def _reassert(self, turn: Turn) -> None:
-        """Bring a box whose limit is above its orders down to them."""
+        """Write the order again to a box that does not have it (any more)."""
         with self.conversing():
             await self.identify(turn)
-            status = self.last_status or await self.read_status(turn)
-            if not self._must_reassert(status):
-                # A command of the user came first.
+            await self.read_status(turn)
+            decision = self.decide(turn.now)
+            if decision is None or not decision.write:
+                # A command of the user came first, or it was only late.
                 return
-            duty = limit_duty(self.setpoint)
-            if duty == self.confirmed and not is_within(status.duty, duty):
-                self.statistics.reasserted += 1
-            await self.apply_setpoint(turn, lambda: self.setpoint)
-            self._fell_back = self.orders_expired
+            failed = self.writes.failed(self.code, turn.now)
+            await self.apply_setpoint(
+                turn,
+                lambda: self.setpoint,
+                patience=WRITE_PAUSES[0] if failed else FAILED_AFTER,
+            )
             if self.setpoint.paused and self.effective_orders.allowed is not False:
-                self._paused_by_limit = True
+                await self.note_pause(by_limit=True)
 
     # -- Commands ----------------------------------------------------------------
 

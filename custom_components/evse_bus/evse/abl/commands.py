@@ -67,12 +67,12 @@ async def _enable_outlet(reader: AblReader, turn: Turn) -> None:
     if state_of(status.state).outlet_enabled is not True:
         if status.state not in (E0, E2):
             raise refuse_in(reader, status, "an outlet is enabled in E0 or E2")
-        was_paused = status.duty == PAUSE
+        was_allowed = reader.paused is False
         await lower_limit(reader, turn, status)
         status = await reach_state(
             reader, turn, StateCode.A1, lambda now: now.state not in (E0, E2)
         )
-        if not was_paused and status.duty < limit_duty(reader.setpoint) != PAUSE:
+        if was_allowed and status.duty < limit_duty(reader.setpoint) != PAUSE:
             # Limits raised while the outlet was disabled have only been stored.
             await reader.apply_setpoint(turn, lambda: reader.setpoint)
     reader.pending_cleanup = None
@@ -85,7 +85,7 @@ async def _wake(reader: AblReader, turn: Turn) -> None:
     status = await reach(reader, turn)
     if status.state != B2:
         raise refuse_in(reader, status, "only a car that may charge can be woken")
-    if status.duty == PAUSE or reader.setpoint.paused:
+    if reader.paused or reader.setpoint.paused:
         raise refuse_in(reader, status, "charging is paused, waking would not help")
     reader.pending_cleanup = Cleanup(StateCode.A1, E0)
     try:

@@ -38,8 +38,8 @@ class AblConfig(ChargerConfig):
 
     poll_interval: float = 2.0
     """s; keeps the box awake, and shows soon that a power cycle has reset the limit."""
-    phase_order: Phases[int] = (1, 2, 3)
-    """The phase that each of Ict1, Ict2, Ict3 measures; some boxes begin with L3."""
+    phase_order: Phases[int] = (3, 2, 1)
+    """The phase that each of Ict1, Ict2, Ict3 measures; most boxes begin with L3."""
 
     def __post_init__(self) -> None:
         """Raise ValueError unless the phase order has each phase once."""

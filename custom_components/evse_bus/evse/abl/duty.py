@@ -65,9 +65,20 @@ def current_for(duty: int) -> float | None:
     return min(float((Decimal(duty) / 10 - 64) * Decimal("2.5")), MAXIMUM_CURRENT)
 
 
-def is_within(duty: int, written: int) -> bool:
-    """Return whether a duty cycle that was read is at or below the one written."""
-    return duty == PAUSE or (written != PAUSE and duty <= written)
+def highest_current(duty: int) -> float | None:
+    """Return the highest current (A, in 0.1 A) whose duty cycle is at most this one.
+
+    ``None``: below the minimum, or no limit at all.
+    """
+    if not _MINIMUM <= duty <= _TOLERATED_END or (current := current_for(duty)) is None:
+        return None
+    tenths = _floor(Decimal(repr(current)) * 10)
+    # 32 A is sent as 53.3 %, which is 31.98 A; above 52.5 A a code spans 0.25 A.
+    return max(
+        current
+        for step in range(tenths, tenths + 4)
+        if duty_for(current := min(step / 10, MAXIMUM_CURRENT)) <= duty
+    )
 
 
 def _floor(value: Decimal) -> int:

@@ -6,6 +6,8 @@ anything else is exchanged (PROTOCOLS.md, 2).
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import chain, repeat
+from math import inf
 from typing import ClassVar, Final, override
 
 from ..charger import Charger
@@ -18,11 +20,22 @@ from ..errors import (
     WrongChargerError,
 )
 from ..exchange import Turn
-from ..model import ChargerConfig, Fault, Orders
+from ..model import ChargerConfig, Fault, Orders, OrderState
 from ..registers import Registers
 from ..safety import Setpoint
 from .config import TIMING, AblConfig, Pauses
-from .duty import PAUSE, is_within
+from .decisions import (
+    FAILED_AFTER,
+    FRESH,
+    IDLE,
+    Decision,
+    Evidence,
+    Standing,
+    Writes,
+    believed_paused,
+    decide,
+)
+from .duty import PAUSE, highest_current
 from .readings import (
     EnergyEstimate,
     Snapshot,
@@ -42,6 +55,7 @@ from .registers import (
     SERIAL,
     STATE_REGISTER,
     Flags,
+    Icmax,
     Info,
     Reading,
     StateCode,
@@ -53,17 +67,24 @@ from .registers import (
     write_limit,
     write_state,
 )
-from .states import E0
+from .states import E0, SETUP, is_failure
 
 FLAGS_INTERVAL: Final = 30.0
 """Time between two reads of the system flags, s."""
 FLAGS_MISSES: Final = 3
 """Unanswered reads of the flags in a row after which the old flags are dropped."""
 
-LIMIT_WRITES: Final = 2
-"""Writes of a limit before it counts as not taken."""
-SETTLING: Final = 0.25
-"""Time for a limit that is not read back at once, s."""
+SETTLING: Final = (0.25, 0.5, 1.0)
+"""Pauses between reads of a limit that does not show at once, s."""
+ICMAX_PROBES: Final = 3
+"""Unanswered reads of 0x000F, each after another reply, that prove its absence."""
+ICMAX_ABSENT: Final = 600.0
+"""Time after which that is tried again, s."""
+
+REPORTS_ICMAX: Final = "reports_icmax"
+"""Note with the orders: serial number of the box that has answered 0x000F."""
+PAUSED_BY_LIMIT: Final = "paused_by_limit"
+"""Note with the orders: serial number of the box that a limit of 0 A has paused."""
 
 
 async def read[T](
@@ -108,16 +129,33 @@ class AblReader(Charger[AblConfig]):
         super().__init__(config, orders)
         self.last_status: Reading | None = None
         """Contents of 0x002E, as read last."""
-        self.has_icmax: bool | None = None
-        """It answers reads of 0x000F; ``None``: not tried yet."""
+        self.reports_icmax: bool | None = None
+        """It answers reads of 0x000F; ``None``: not known yet."""
         self.confirmed: int | None = None
         """Duty cycle (0.1 %) of the last limit that was read back."""
+        self.writes = Writes()
+        self.raise_pending = False
+        """A limit was raised, and not written in the state the box was in."""
+        self.missed = False
+        """A reply was missed since the last limit was read back."""
+        self.allowed_by_user = False
+        """The user has allowed charging, and no reply was missed since."""
+        self.limit_paused = False
+        """Our limit of 0 A has paused it, and no reply was missed since."""
         self.pending_cleanup: Cleanup | None = None
         """State that a command brought about and has not ended yet."""
         self._serial: str | None = None
         self._info: Info | None = None
         self._flags: Flags | None = None
-        self._icmax: int | None = None
+        self._icmax: Icmax | None = None
+        self._icmax_at = -inf
+        self._icmax_due = -inf
+        self._icmax_silent = 0
+        self._default: int | None = None
+        self._status_at = 0.0
+        self._charging_since = inf
+        self._state: int | None = None
+        self._state_written: int | None = None
         self._identified = False
         self._flags_due = 0.0
         self._flags_missed = 0
@@ -141,8 +179,8 @@ class AblReader(Charger[AblConfig]):
     @property
     @override
     def exchanges_per_turn(self) -> int:
-        # Identity (info, serial twice), status, limit, status twice.
-        return 7
+        # Identity (info, serial twice), status, Icmax, limit, status and Icmax twice.
+        return 11
 
     # -- Identity ----------------------------------------------------------------
 
@@ -157,14 +195,27 @@ class AblReader(Charger[AblConfig]):
         self._flags = None
         self._flags_due = 0.0
         self._icmax = None
-        self.has_icmax = None
+        self.reports_icmax = None
+        self._forget()
         self._energy.interrupt()
 
     @override
     def on_missed(self, now: float) -> None:
         super().on_missed(now)
+        self._forget()
         # The next reply may come from another box.
         self._identified = False
+        since = self.misses - self.timing.misses
+        if since > 0 and since % 2:
+            # It may be asleep, and has lost the first request: a probe is a pair.
+            self.slot.ready = self.slot.due = now + self.timing.retry_pauses[0]
+
+    def _forget(self) -> None:
+        """Drop what a power cut or another master may have changed unseen."""
+        self.missed = True
+        self.allowed_by_user = self.limit_paused = False
+        self.writes.forget()
+        self._icmax_silent = 0
 
     @property
     def serial(self) -> str | None:
@@ -189,8 +240,13 @@ class AblReader(Charger[AblConfig]):
             message = f"found {found} at device-ID {address}, expected {expected}"
             raise WrongChargerError(message, expected=expected, found=found)
         self.notice(Fault.WRONG_CHARGER, present=False)
+        if serial != self._serial:
+            self._default = None
         self._serial = serial
         self._info = info
+        if serial and self.orders.remembered.get(REPORTS_ICMAX) == serial:
+            # Its silence is a missed reply from now on, and proves nothing.
+            self.reports_icmax = True
         self._identified = True
         self.info = charger_info(info, serial, self._flags)
 
@@ -218,6 +274,7 @@ class AblReader(Charger[AblConfig]):
         The flags are due every `FLAGS_INTERVAL`, and when the status has changed.
         """
         status = await read(turn, self.config.address, READING)
+        await self.read_icmax(turn)
         last = self.last_status
         if (
             last is None
@@ -231,16 +288,25 @@ class AblReader(Charger[AblConfig]):
     async def read_status(self, turn: Turn) -> Reading:
         """Read the status in the midst of a conversation, and keep it."""
         status = await read(turn, self.config.address, READING, attempts=2)
+        await self.read_icmax(turn)
         self.keep_status(status, turn.now)
         return status
 
     def keep_status(self, status: Reading, now: float) -> None:
         """Keep a status read at a loop time (s), and make the reading of it."""
+        self._note_state(status.state, now)
         self.last_status = status
-        if self._info is None:
+        self._status_at = now
+        decision = self.decide(now)
+        if self._info is None or decision is None:
             return
         snapshot = Snapshot(
-            reading=status, info=self._info, flags=self._flags, icmax=self._icmax
+            reading=status,
+            info=self._info,
+            flags=self._flags,
+            icmax=self._icmax,
+            paused=decision.paused,
+            offered=decision.offered,
         )
         currents = phase_currents(snapshot, self.config.phase_order)
         power = power_of(currents, self.config.voltage)
@@ -252,18 +318,57 @@ class AblReader(Charger[AblConfig]):
         if changed:
             self.updated()
 
+    def _note_state(self, state: int, now: float) -> None:
+        charging = not (state in IDLE | SETUP or is_failure(state))
+        if not charging:
+            self._charging_since = inf
+        elif self._charging_since == inf:
+            self._charging_since = now
+        self._state = state
+
+    async def read_icmax(self, turn: Turn) -> None:
+        """Read Icmax, after another reply; find out whether the box answers at all."""
+        if self.reports_icmax is False:
+            if turn.now < self._icmax_due:
+                return
+            self.reports_icmax = None
+            self._icmax_silent = 0
+        try:
+            icmax = await read(turn, self.config.address, ICMAX)
+        except GarbledReplyError:
+            return
+        except ExchangeRefusedError:
+            self._icmax_silent = ICMAX_PROBES
+        except ReplyTimeoutError:
+            self._icmax_silent += 1
+        else:
+            await self._keep_icmax(icmax, turn.now)
+            return
+        if self.reports_icmax is None and self._icmax_silent >= ICMAX_PROBES:
+            self.reports_icmax = False
+            self._icmax_due = turn.now + ICMAX_ABSENT
+
+    async def _keep_icmax(self, icmax: Icmax, now: float) -> None:
+        self._icmax = icmax
+        self._icmax_at = now
+        self._icmax_silent = 0
+        self.reports_icmax = True
+        if highest_current(icmax.default) is not None:
+            self._default = icmax.default
+        if icmax.duty not in (0, PAUSE) and self.code != PAUSE:
+            # It has ended: a later pause is not ours.
+            await self.note_pause(by_limit=False)
+        if self._serial is not None and self._identified:
+            await self.remember(REPORTS_ICMAX, self._serial)
+
     async def read_flags(self, turn: Turn) -> None:
-        """Read flags and Icmax; without a reply the old values count for a while."""
+        """Read the flags; without a reply the old values count for a while."""
         try:
             self._flags = await read(turn, self.config.address, FLAGS)
-            if self.has_icmax:
-                icmax = await read(turn, self.config.address, ICMAX)
-                self._icmax = icmax.duty
         except ReplyTimeoutError, ExchangeRefusedError:
             self._flags_missed += 1
             if self._flags_missed >= FLAGS_MISSES:
                 self._flags = None
-                self._icmax = None
                 self._flags_due = turn.now + FLAGS_INTERVAL
             return
         self._flags_missed = 0
@@ -271,56 +376,180 @@ class AblReader(Charger[AblConfig]):
         if self._info is not None:
             self.info = charger_info(self._info, self._serial, self._flags)
 
-    async def probe_icmax(self, turn: Turn) -> None:
-        """Find out whether the box has register 0x000F, which is not in the manual."""
-        # Silence means no; it is not a missed reply.
-        self.has_icmax = False
-        try:
-            icmax = await read(turn, self.config.address, ICMAX)
-        except ReplyTimeoutError, ExchangeRefusedError:
-            return
-        self.has_icmax = True
-        self._icmax = icmax.duty
+    # -- What the registers prove --------------------------------------------------
+
+    @property
+    def code(self) -> int:
+        """Return Icmax that the orders come to, 0.1 %."""
+        return limit_duty(self.setpoint)
+
+    @property
+    def highest(self) -> float | None:
+        """Return the highest current that the box allows, A; ``None``: not reported."""
+        return None if self._default is None else highest_current(self._default)
+
+    def evidence(self, status: Reading, now: float) -> Evidence:
+        """Return what was read, with Icmax if it is fresh."""
+        known = [current for current in status.currents if current is not None]
+        fresh = self._icmax is not None and now - self._icmax_at <= FRESH
+        return Evidence(
+            state=status.state,
+            ic=status.duty,
+            reports_icmax=self.reports_icmax,
+            icmax=self._icmax.duty if self._icmax is not None and fresh else None,
+            current=max(known, default=None),
+            charging_for=max(0.0, now - self._charging_since),
+        )
+
+    def standing(self, now: float) -> Standing:
+        """Return the order that stands, and what has become of it."""
+        code = self.code
+        writes = self.writes
+        acknowledged = writes.acknowledged if writes.code == code else None
+        return Standing(
+            code=code,
+            acknowledged=None if acknowledged is None else now - acknowledged,
+            standing_for=writes.standing_for(code, now),
+            state_changed=self._state_written != self._state,
+            raised=self.raise_pending,
+            confirmed=self.confirmed is not None,
+            missed=self.missed,
+            allowed=self.allowed_by_user,
+            failed=writes.failed(code, now),
+        )
+
+    def decide(self, now: float) -> Decision | None:
+        """Return what is known about the order; ``None``: nothing was read yet."""
+        if self.last_status is None:
+            return None
+        return decide(self.evidence(self.last_status, now), self.standing(now))
+
+    @property
+    def order_state(self) -> OrderState | None:
+        """Return what was proved about the order when the status was read last."""
+        decision = self.decide(self._status_at)
+        return None if decision is None else decision.state
+
+    @property
+    def paused(self) -> bool | None:
+        """Return whether the box is paused, as far as its registers show."""
+        if self.last_status is None:
+            return None
+        return believed_paused(self.evidence(self.last_status, self._status_at))
+
+    @property
+    def paused_by_our_limit(self) -> bool:
+        """Return whether a limit of 0 A of ours has paused it, not the user.
+
+        After a restart or a missed reply that needs proof: the serial number, and the
+        pause in its register.
+        """
+        noted = self.orders.remembered.get(PAUSED_BY_LIMIT)
+        proved = noted is not None and noted == self.serial and self.paused is True
+        return self.limit_paused or proved
+
+    async def note_pause(self, *, by_limit: bool) -> None:
+        """Note who has paused the box, also for the time after a restart."""
+        self.limit_paused = by_limit
+        await self.remember(PAUSED_BY_LIMIT, self.serial if by_limit else None)
 
     # -- Writes ------------------------------------------------------------------
 
     async def apply_setpoint(
-        self, turn: Turn, setpoint: Callable[[], Setpoint], *, starts: bool = False
+        self,
+        turn: Turn,
+        setpoint: Callable[[], Setpoint],
+        *,
+        starts: bool = False,
+        patience: float = FAILED_AFTER,
     ) -> Reading:
-        """Write a set-point until the limit read back is at or below it.
+        """Write a set-point until the register that means it shows it.
 
         ``setpoint`` is called for each write: the orders may change between turns.
-        ``starts``: a pause that is read back does not count as below. Returns the
-        status that confirms it.
+        ``starts``: a pause that is read back does not count as below. Waits for
+        ``patience`` seconds at most. Returns the status that confirms it.
 
         Raises NotConfirmedError when the box does not follow, ExchangeRefusedError
         when it refuses.
         """
-        for attempt in range(LIMIT_WRITES):
-            if attempt:
-                self.statistics.reasserted += 1
-            limit = setpoint()
-            duty = limit_duty(limit)
+        until = turn.now + patience
+        pauses = chain(SETTLING, repeat(SETTLING[-1]))
+        refused: ExchangeRefusedError | None = None
+        has_rested = False
+        while True:
+            wanted = setpoint()
+            code = limit_duty(wanted)
+            over = turn.now >= until
             try:
-                await turn.exchange(
-                    write_limit(self.config.address, limit),
-                    write_answer(self.config.address, LIMIT_REGISTER),
-                )
-            except ExchangeRefusedError:
-                self.notice(Fault.LIMIT_NOT_TAKEN, present=True)
-                raise
-            for pause in (SETTLING, None):
+                if turn.now >= self.writes.due(code, turn.now) and not over:
+                    # A reply may have been missed since the last turn.
+                    await self.identify(turn)
+                    await self._write_limit(turn, wanted)
                 status = await self.read_status(turn)
-                still_paused = starts and status.duty == PAUSE != duty
-                if is_within(status.duty, duty) and not still_paused:
-                    self.confirmed = duty
-                    self.notice(Fault.LIMIT_NOT_TAKEN, present=False)
-                    return status
-                if pause is not None:
-                    await rest(pause)
+            except ExchangeRefusedError as error:
+                # It may have been taken all the same: read first, then repeat.
+                refused = error
+                status = await self.read_status(turn)
+            except ReplyTimeoutError:
+                # Before a rest the bus repeats the whole conversation.
+                if not has_rested or over:
+                    raise
+                await rest(next(pauses))
+                continue
+            if self._is_taken(status, turn.now, code, starts=starts, finally_=over):
+                if code != PAUSE:
+                    self.confirmed = code
+                self.notice(Fault.LIMIT_NOT_TAKEN, present=False)
+                return status
+            if over:
+                break
+            await rest(min(next(pauses), max(until - turn.now, 0.0)))
+            has_rested = True
         self.notice(Fault.LIMIT_NOT_TAKEN, present=True)
+        if refused is not None:
+            raise refused
         message = f"{self.config.name} does not follow its limit"
         raise NotConfirmedError(message)
+
+    async def _write_limit(self, turn: Turn, setpoint: Setpoint) -> None:
+        code = limit_duty(setpoint)
+        if self.writes.is_repeat(code, turn.now):
+            self.statistics.reasserted += 1
+        self.writes.wrote(code, turn.now)
+        self.raise_pending = False
+        # Only what is read after the write counts.
+        self._icmax = None
+        try:
+            await turn.exchange(
+                write_limit(self.config.address, setpoint),
+                write_answer(self.config.address, LIMIT_REGISTER),
+            )
+        except ReplyTimeoutError:
+            self.writes.unanswered()
+            raise
+        self.writes.acknowledge(turn.now)
+        self._state_written = self._state
+
+    def _is_taken(
+        self, status: Reading, now: float, code: int, *, starts: bool, finally_: bool
+    ) -> bool:
+        """Return whether what was just read confirms a code.
+
+        ``finally_``: there is no more time to wait for a raise.
+        """
+        seen = self.evidence(status, now)
+        if PAUSE in (seen.ic, seen.icmax):
+            return code == PAUSE or not starts
+        if seen.reports_icmax:
+            if seen.icmax is None or code == PAUSE:
+                return False
+            return seen.icmax == code or (finally_ and seen.icmax < code)
+        if self.writes.code != code or self.writes.acknowledged is None:
+            return False
+        if seen.reports_icmax is None:
+            # It may still show that it can be read.
+            return False
+        return seen.idle if code == PAUSE else 0 < seen.ic <= code
 
     async def set_state(self, turn: Turn, code: StateCode) -> bool:
         """Write a state code once; return whether the box has confirmed it.

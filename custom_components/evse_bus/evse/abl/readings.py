@@ -4,14 +4,16 @@ from dataclasses import dataclass
 
 from ..model import UNKNOWN_PHASES, Fault, Phases, Status
 from ..readings import ChargerInfo, ChargerReading, ConnectorReading
-from .duty import PAUSE, current_for
-from .registers import Flags, Info, Reading
+from .duty import current_for
+from .registers import Flags, Icmax, Info, Reading
 from .states import B1, B2, C3, C4, state_of
 
 SHORTEST_GAP = 10.0
 """Energy is always summed between two readings up to this far apart, s."""
 GAP_INTERVALS = 3.0
 """Else energy is summed over at most so many poll intervals."""
+FLOOR = 0.1
+"""A measured current of so much is none, A."""
 TOLERATED = 100
 """% of Ic: up to 105 % has no consequence in the box (0x0006, bits 2..0)."""
 _SECONDS_PER_HOUR = 3600.0
@@ -28,8 +30,12 @@ class Snapshot:
     info: Info
     flags: Flags | None = None
     """``None``: not read yet, or too long ago."""
-    icmax: int | None = None
-    """Duty cycle Icmax, 0.1 %; ``None`` on boxes without register 0x000F."""
+    icmax: Icmax | None = None
+    """``None``: not read, or no register 0x000F."""
+    paused: bool | None = None
+    """Charging is not allowed; ``None``: unknown."""
+    offered: int | None = None
+    """Duty cycle that is offered, 0.1 %; ``None``: unknown."""
 
 
 class EnergyEstimate:
@@ -66,14 +72,19 @@ def phase_currents(snapshot: Snapshot, order: Phases[int]) -> Phases[float | Non
 
     ``order``: the phase that each of Ict1 to Ict3 measures. A missing value is 0 A
     only in a state with an open contactor on a box with a working meter
-    (PROTOCOLS.md, 2); else it is unknown.
+    (PROTOCOLS.md, 2); else it is unknown. 0.1 A is the floor of the meter, which it
+    shows on idle phases.
     """
     if not snapshot.info.meter or (
         snapshot.flags is not None and snapshot.flags.meter_failed
     ):
         return UNKNOWN_PHASES
     zero = state_of(snapshot.reading.state).no_current and snapshot.flags is not None
-    by_phase = dict(zip(order, snapshot.reading.currents, strict=True))
+    measured = (
+        0.0 if current is not None and current <= FLOOR else current
+        for current in snapshot.reading.currents
+    )
+    by_phase = dict(zip(order, measured, strict=True))
     one, two, three = (
         0.0 if by_phase[phase] is None and zero else by_phase[phase]
         for phase in (1, 2, 3)
@@ -96,13 +107,12 @@ def charger_reading(
     """Return the reading; power (W) and energy (Wh) are estimates."""
     reading = snapshot.reading
     state = state_of(reading.state)
-    paused = reading.duty == PAUSE
-    offered = current_for(reading.duty)
+    offered = None if snapshot.offered is None else current_for(snapshot.offered)
     faults, codes = faults_of(snapshot)
     connector = ConnectorReading(
         status=(
             Status.SUSPENDED_EVSE
-            if paused and reading.state in (B1, B2)
+            if snapshot.paused and reading.state in (B1, B2)
             else state.status
         ),
         raw_state=state.name,
@@ -114,7 +124,7 @@ def charger_reading(
     )
     return ChargerReading(
         connectors={1: connector},
-        allowed=_allowed(outlet_enabled=state.outlet_enabled, offered=offered),
+        allowed=_allowed(outlet_enabled=state.outlet_enabled, paused=snapshot.paused),
         # In Ex and Fx the duty cycle has a value, but nothing is offered.
         offered_current=offered if state.outlet_enabled else None,
         outlet_enabled=state.outlet_enabled,
@@ -124,11 +134,11 @@ def charger_reading(
     )
 
 
-def _allowed(*, outlet_enabled: bool | None, offered: float | None) -> bool | None:
-    """Return whether a car may charge (neither E0 nor 100 %); ``None``: unknown."""
+def _allowed(*, outlet_enabled: bool | None, paused: bool | None) -> bool | None:
+    """Return whether a car may charge (neither E0 nor a pause); ``None``: unknown."""
     if outlet_enabled is not True:
         return outlet_enabled
-    return None if offered is None else offered > 0
+    return None if paused is None else not paused
 
 
 def faults_of(snapshot: Snapshot) -> tuple[frozenset[Fault], tuple[str, ...]]:
@@ -159,7 +169,10 @@ def _details(snapshot: Snapshot) -> dict[str, str | int | float | bool | None]:
     reading = snapshot.reading
     details: dict[str, str | int | float | bool | None] = {
         "ic_duty": reading.duty / 10,
-        "icmax_duty": None if snapshot.icmax is None else snapshot.icmax / 10,
+        "icmax_duty": None if snapshot.icmax is None else snapshot.icmax.duty / 10,
+        "default_duty": (
+            None if snapshot.icmax is None else snapshot.icmax.default / 10
+        ),
         "reduced": reading.reduced,
         "en1": reading.en1,
         "en2": reading.en2,

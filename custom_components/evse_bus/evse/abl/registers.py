@@ -118,14 +118,20 @@ FLAGS: Final = Registers(Flags, "0x0006", Block(0x0006, 2))
 
 @record
 class Icmax:
-    """Highest duty cycle that the box offers."""
+    """Icmax as written, and the box's own limits; the bits above each are unknown."""
 
+    rated: int = bits(59, 48, Number(unit="0.1 %"))
+    """Rated current of the box."""
+    default: int = bits(43, 32, Number(unit="0.1 %"))
+    """Idefault: the highest Icmax that is followed."""
     duty: int = bits(27, 16, Number(unit="0.1 %"))
-    """0.1 %"""
+    """Icmax, 0.1 %; a pause shows here and nowhere else."""
+    offered: int = bits(11, 0, Number(unit="0.1 %"))
+    """Once seen as 0 on a box that offered 14 A: nothing is decided by it."""
 
 
 ICMAX: Final = Registers(Icmax, "PROTOCOLS.md, 2: 0x000F", Block(0x000F, 5))
-"""Not in the manual; only some boxes answer."""
+"""Not in the manual; most boxes in the field answer (docs/abl.md)."""
 
 
 @record

@@ -110,6 +110,11 @@ _FAILURES: Final = 0xF0
 _OUT_OF_ORDER: Final = 0xE0
 
 
+def is_failure(code: int) -> bool:
+    """Return whether a state byte is one of Fx."""
+    return code & 0xF0 == _FAILURES
+
+
 def state_of(code: int) -> State:
     """Return the state of a state byte; an unknown one is named by its value."""
     if (known := STATES.get(code)) is not None:

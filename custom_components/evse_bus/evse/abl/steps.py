@@ -16,10 +16,10 @@ from ..errors import (
     ReplyTimeoutError,
 )
 from ..exchange import Turn
-from .duty import is_within
+from .duty import PAUSE
 from .reader import AblReader
 from .registers import Reading, StateCode, limit_duty
-from .states import E0, E2, state_of
+from .states import E0, E2, SETUP, state_of
 
 REACH_ATTEMPTS: Final = 3
 """Attempts to reach a box that may be asleep."""
@@ -89,7 +89,8 @@ async def recover(reader: AblReader, turn: Turn, *, was_disabled: bool) -> Readi
     A reset ends in A1 with Idefault: neither the limit nor E0 has survived it.
     """
     status = await _wait_for_boot(reader, turn)
-    status = await lower_limit(reader, turn, status)
+    # It allows charging now, whoever had paused it: no pause can be ended.
+    status = await lower_limit(reader, turn, status, is_reset=True)
     if was_disabled:
         return await disable(reader, turn, status)
     if status.state != E2:
@@ -107,11 +108,23 @@ async def _wait_for_boot(reader: AblReader, turn: Turn) -> Reading:
     return await _contact(reader, turn)
 
 
-async def lower_limit(reader: AblReader, turn: Turn, status: Reading) -> Reading:
-    """Lower the limit to the set-point before a car can start; return the status."""
-    if is_within(status.duty, limit_duty(reader.setpoint)):
+async def lower_limit(
+    reader: AblReader, turn: Turn, status: Reading, *, is_reset: bool = False
+) -> Reading:
+    """Lower the limit to the set-point before a car can start; return the status.
+
+    A limit above it that may hide the pause of another is left alone, but after a
+    reset.
+    """
+    code = limit_duty(reader.setpoint)
+    paused = reader.paused
+    if paused is True or status.state in SETUP:
         return status
-    return await reader.apply_setpoint(turn, lambda: reader.setpoint)
+    decision = reader.decide(turn.now)
+    lost = decision is not None and decision.write and not reader.raise_pending
+    if lost or code == PAUSE or (is_reset and status.duty > code):
+        return await reader.apply_setpoint(turn, lambda: reader.setpoint)
+    return status
 
 
 async def disable(reader: AblReader, turn: Turn, status: Reading) -> Reading:
