@@ -1,7 +1,7 @@
 """Diagnostics of a bus and its chargers, without data that identifies a house."""
 
 from collections.abc import Mapping, Sequence, Set as AbstractSet
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from datetime import UTC, datetime
 from math import isfinite
 from typing import Any, Final
@@ -135,7 +135,7 @@ def _charger(coordinator: BusCoordinator, managed: ManagedCharger) -> dict[str, 
         "misses": charger.misses,
         "faults": plain(charger.faults),
         "noticed": plain(charger.noticed),
-        "orders": plain(charger.orders),
+        "orders": plain(replace(charger.orders, remembered={})),
         "orders_expired": charger.orders_expired,
         "setpoint": plain(charger.setpoint),
         "limits": plain(charger.limits),

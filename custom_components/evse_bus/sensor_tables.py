@@ -29,6 +29,7 @@ from .evse.model import (
     Capability,
     FailSafe,
     Fault,
+    OrderState,
     PauseReason,
     Phases,
     SessionResult,
@@ -318,6 +319,15 @@ CHARGER_SENSORS: Final[tuple[ChargerSensorDescription, ...]] = (
         device_class=SensorDeviceClass.ENUM,
         options=[NO_PAUSE, *(str(reason) for reason in PauseReason)],
         value=lambda charger: charger.pause_reason or NO_PAUSE,
+    ),
+    ChargerSensorDescription(
+        key="order_state",
+        translation_key="order_state",
+        entity_category=EntityCategory.DIAGNOSTIC,
+        device_class=SensorDeviceClass.ENUM,
+        options=[str(one) for one in OrderState],
+        capability=Capability.ORDER_STATE,
+        value=lambda charger: charger.order_state,
     ),
 )
 

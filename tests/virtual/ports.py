@@ -229,8 +229,11 @@ class DirectTransport:
         """End the connection; `connection_lost` is called soon."""
         if self._port.client is self:
             self._port.client = None
-            self._loop.call_soon(self.protocol.connection_lost, error)
-            self._closed.set_result(None)
+            self._loop.call_soon(self._lost, error)
+
+    def _lost(self, error: Exception | None) -> None:
+        self.protocol.connection_lost(error)
+        self._closed.set_result(None)
 
 
 class DirectPort:

@@ -145,7 +145,7 @@ class AblCharger(AblReader):
             self.raise_pending = decision.paused is not True and status.state != E0
             decision = self.decide(now) or decision
         self._note(decision)
-        if decision.write and now >= self.writes.due(self.code, now):
+        if decision.write and now >= self.writes.due(self.code):
             return FollowUp(self._reassert)
         return None
 
@@ -278,12 +278,14 @@ class AblCharger(AblReader):
                 # A command of the user came first, or it was only late.
                 return
             failed = self.writes.failed(self.code, turn.now)
+            was_paused = decision.paused is True
             await self.apply_setpoint(
                 turn,
                 lambda: self.setpoint,
                 patience=WRITE_PAUSES[0] if failed else FAILED_AFTER,
             )
-            if self.setpoint.paused and self.effective_orders.allowed is not False:
+            by_limit = self.effective_orders.allowed is not False
+            if self.setpoint.paused and by_limit and not was_paused:
                 await self.note_pause(by_limit=True)
 
     # -- Commands ----------------------------------------------------------------

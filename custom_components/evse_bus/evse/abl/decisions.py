@@ -269,12 +269,12 @@ class Writes:
         self._count = 0
         self._unanswered = 0
 
-    def due(self, code: int, now: float) -> float:
+    def due(self, code: int) -> float:
         """Return the loop time from which a code may be written, s."""
         if code != self.code or not self._count:
-            return now
+            return -inf
         if 0 < self._unanswered <= FREE_REPEATS:
-            return now
+            return -inf
         pause = WRITE_PAUSES[min(self._count, len(WRITE_PAUSES)) - 1]
         return self.last + pause
 
@@ -287,7 +287,7 @@ class Writes:
         """Note a write."""
         if code != self.code:
             self.acknowledged = None
-        if code != self.code or not self._count or now - self.last > WRITE_PAUSES[-1]:
+        if not self.is_repeat(code, now):
             self._first = now
             self._count = 0
         self.code = code
@@ -305,11 +305,8 @@ class Writes:
 
     def is_repeat(self, code: int, now: float) -> bool:
         """Return whether a write of this code would repeat a recent one."""
-        return (
-            code == self.code
-            and now - self.last <= WRITE_PAUSES[-1]
-            and bool(self._count)
-        )
+        recent = now - self.last <= 2 * WRITE_PAUSES[-1]
+        return code == self.code and recent and self._count > 0
 
     def settled(self, code: int, now: float) -> bool:
         """Return whether no other code written may still take effect."""

@@ -76,6 +76,8 @@ FLAGS_MISSES: Final = 3
 
 SETTLING: Final = (0.25, 0.5, 1.0)
 """Pauses between reads of a limit that does not show at once, s."""
+PROBE_REQUESTS: Final = 3
+"""Requests of one probe of a silent box, 0.7 s apart: one at a time never wakes it."""
 ICMAX_PROBES: Final = 3
 """Unanswered reads of 0x000F, each after another reply, that prove its absence."""
 ICMAX_ABSENT: Final = 600.0
@@ -206,8 +208,8 @@ class AblReader(Charger[AblConfig]):
         # The next reply may come from another box.
         self._identified = False
         since = self.misses - self.timing.misses
-        if since > 0 and since % 2:
-            # It may be asleep, and has lost the first request: a probe is a pair.
+        if since > 0 and since % PROBE_REQUESTS:
+            # It may be asleep, and has lost the first request or two.
             self.slot.ready = self.slot.due = now + self.timing.retry_pauses[0]
 
     def _forget(self) -> None:
@@ -481,7 +483,7 @@ class AblReader(Charger[AblConfig]):
             code = limit_duty(wanted)
             over = turn.now >= until
             try:
-                if turn.now >= self.writes.due(code, turn.now) and not over:
+                if turn.now >= self.writes.due(code) and not over:
                     # A reply may have been missed since the last turn.
                     await self.identify(turn)
                     await self._write_limit(turn, wanted)
