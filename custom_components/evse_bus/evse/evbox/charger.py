@@ -130,7 +130,8 @@ class EvboxCharger(Charger[EvboxConfig]):
         self._serial = config.serial
         """The expected serial number; ``None``: not known yet."""
         self._other_serial: str | None = None
-        """The serial number of the last reply, if it was not the expected one."""
+        """The serial number of the last reply, if it was not the expected one, or if
+        none is expected yet."""
         self._wrong_charger: WrongChargerError | None = None
         """The reason why nothing more is sent."""
         self._sent_at: float | None = None
@@ -284,7 +285,7 @@ class EvboxCharger(Charger[EvboxConfig]):
     # -- Evaluation of a reply ---------------------------------------------------
 
     def _check_identity(self, reply: Reply) -> None:
-        """Check the serial number of a reply, if it has one.
+        """Check the serial number of a reply, if it has one; learn it from two.
 
         Raises ImplausibleReplyError for the first reply with another one,
         WrongChargerError for the second.
@@ -293,6 +294,10 @@ class EvboxCharger(Charger[EvboxConfig]):
         if found is None:
             return
         if self._serial is None:
+            # One reply may be corrupt: the box is known when two agree.
+            if found != self._other_serial:
+                self._other_serial = found
+                return
             self._serial = found
         if same_serial(self._serial, found):
             self._other_serial = None
@@ -332,7 +337,10 @@ class EvboxCharger(Charger[EvboxConfig]):
         self.notice(Fault.LIMIT_EXCEEDED, present=exceeded)
         self.notice(Fault.OVERCURRENT, present=accepted.over_current)
         self.notice(Fault.IMPLAUSIBLE, present=accepted.out_of_range)
-        serial = serial_number(reply)
+        if self._monitor.unconfirmed:
+            # It may be corrupt as a whole: shown only if the next reply agrees.
+            return
+        serial = serial_number(reply) if self._serial is not None else None
         if self.info is None or self.info.serial != serial:
             self.info = charger_info(serial)
         maximum = self._plausibility.maximum
@@ -392,6 +400,7 @@ class EvboxCharger(Charger[EvboxConfig]):
         soon = (
             self._outdated
             or self._plausibility.unconfirmed
+            or self._monitor.unconfirmed
             or self._other_serial is not None
         )
         sent_at = now if self._sent_at is None else self._sent_at

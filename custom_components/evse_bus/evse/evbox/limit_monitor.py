@@ -26,6 +26,14 @@ class LimitMonitor:
         self._limits: deque[tuple[float, Phases[float]]] = deque([(-inf, _NO_LIMIT)])
         self._above = 0
 
+    @property
+    def unconfirmed(self) -> bool:
+        """Return whether the last reading was above the limits, as the first in a row.
+
+        It may be damaged: the next one decides.
+        """
+        return 0 < self._above < READINGS
+
     def sent(self, now: float, currents: Phases[float], *, answered: bool) -> None:
         """Record limits that were sent (A); unanswered, they may be in force or not."""
         if not answered:

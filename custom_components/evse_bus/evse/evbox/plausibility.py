@@ -117,11 +117,15 @@ class ConfirmedValue:
         """The value in the last reply."""
         self.confirmed = False
         """Two replies have reported one."""
+        self.agreed: float | None = None
+        """The last value that two replies in a row agreed on."""
         self._before = start
 
     def update(self, reported: float) -> None:
         """Take the value of a reply."""
         self.confirmed = self.reported is not None
+        if reported == self.reported:
+            self.agreed = reported
         self.value = min(self._before, reported)
         self.reported = self._before = reported
 
@@ -230,11 +234,14 @@ class Plausibility:
     def _highest_current(self, reply: Reply) -> float:
         """Return the highest used current of a phase that is plausible, A.
 
-        From the confirmed maximum or that of this reply, whichever is higher: cars
-        need time to follow a maximum that was lowered.
+        From the last maximum that replies agreed on, also while it is being lowered:
+        cars need time to follow. That of this reply counts only before the first one,
+        since a damaged reply may raise maximum and currents together.
         """
         maximum = self.maximum.value
-        if reply.maximum_current <= LARGEST_CONNECTION:
+        if self.maximum.agreed is not None:
+            maximum = max(maximum, self.maximum.agreed)
+        elif reply.maximum_current <= LARGEST_CONNECTION:
             maximum = max(maximum, reply.maximum_current)
         return maximum * CURRENT_FACTOR + CURRENT_OFFSET
 
