@@ -100,6 +100,8 @@ def _bus(
         "bus": {
             "connected": bus.connected,
             "utilisation": bus.wire.statistics.utilisation(bus.now),
+            "reply_timeout": round(bus.wire.round_trip.timeout, 3),
+            "round_trip": bus.wire.round_trip.mean,
             **plain(bus.wire.statistics),
         },
         "frames": _frames(coordinator, bus, chargers),

@@ -92,6 +92,7 @@ class Bus(Observable):
         self.name = name or line.url
         self.wire = Wire(line, framer, timing)
         self.wire.on_unsolicited = self._on_unsolicited
+        self.wire.on_timeout_changed = self._update_worst_cases
         self.chargers: dict[str, Charger] = {}
         self.connected = False
         """The port is open."""
@@ -252,6 +253,10 @@ class Bus(Observable):
     def reschedule(self) -> None:
         """Choose anew who speaks next: something has changed."""
         self._timer.wake()
+
+    def _update_worst_cases(self) -> None:
+        for charger in self.chargers.values():
+            charger.slot.worst_case = self.worst_case(charger)
 
     def worst_case(self, charger: Charger) -> float:
         """Return the longest time one turn of a charger can take, s."""

@@ -5,6 +5,7 @@ A frame that matches no request is passed on as unsolicited, or counted as forei
 
 import asyncio
 from collections.abc import Callable
+from dataclasses import dataclass
 from math import inf
 from typing import Final
 
@@ -18,6 +19,7 @@ from .errors import (
 from .framing import Frame, Framer, Timing
 from .line import Line
 from .recovery import LineRecovery
+from .round_trip import RoundTrip
 from .statistics import BusStatistics, ChargerStatistics, Direction, FrameLog
 
 _BASE_REQUEST: Final = 64
@@ -38,6 +40,9 @@ class Wire:
         self.statistics = BusStatistics()
         self.frames = FrameLog()
         self.recovery = LineRecovery()
+        self.round_trip = RoundTrip(timing)
+        self.on_timeout_changed: Callable[[], None] = lambda: None
+        """Called when the reply time-out has changed, and with it all worst cases."""
         self.on_unsolicited: Callable[[Frame], bool] = lambda _frame: False
         """Called with a good frame that is no reply; returns whether it was used."""
         self.sent_at: float | None = None
@@ -45,6 +50,7 @@ class Wire:
         self._framer = framer
         self._received_at = -inf
         self._pending: _PendingReply | None = None
+        self._unanswered: _Unanswered | None = None
         line.on_data = self._on_data
 
     def exchange_time(self, request_bytes: int = _BASE_REQUEST) -> float:
@@ -53,7 +59,8 @@ class Wire:
         # Where silence is required, other masters may delay it.
         silence = timing.silence_patience if timing.silence else 0.0
         wire = (request_bytes + timing.longest_reply) * self.line.settings.byte_time
-        return silence + wire + timing.reply_timeout + timing.gap
+        trip = self.round_trip
+        return silence + wire + trip.timeout + trip.drain + timing.gap
 
     def send_time(self, request_bytes: int) -> float:
         """Return the longest time that sending without a reply can take, s."""
@@ -63,6 +70,7 @@ class Wire:
     def reset(self) -> None:
         """Drop an incomplete frame: the line was opened anew."""
         self._framer.reset()
+        self._unanswered = None
         self.recovery.opened()
 
     def fail(self, error: LineLostError) -> None:
@@ -81,6 +89,7 @@ class Wire:
     ) -> T:
         """Send a request and wait for its reply (see `Turn.exchange`)."""
         self.sent_at = None
+        is_repeat = await self._drain()
         await self._silence()
         data = request() if callable(request) else request
         loop = asyncio.get_running_loop()
@@ -91,7 +100,7 @@ class Wire:
         self.sent_at = sent
         pending = _PendingReply(
             accept,
-            first_byte_by=sent + self.timing.reply_timeout + patience,
+            first_byte_by=sent + self.round_trip.timeout + patience,
             longest=self.timing.longest_reply * self.line.settings.byte_time,
             gap=self.timing.gap,
         )
@@ -106,6 +115,7 @@ class Wire:
             counted.timeouts += 1
             if self._received_at < started:
                 self.recovery.unanswered(loop.time())
+            self._unanswered = _Unanswered(accept, sent, loop.time())
             self._framer.reset()
             unreadable = self._framer.bad - bad
             if unreadable or self._framer.noise > noise:
@@ -120,6 +130,8 @@ class Wire:
                 self.line.answered()
                 self.statistics.replies += 1
                 counted.reply(pending.answered_at - started)
+                if not is_repeat and not patience:
+                    self._measure(pending.answered_at - sent)
         if not self.line.is_open:
             # Lost together with the reply: the conversation must not go on.
             message = f"{self.line.url} was lost"
@@ -139,6 +151,39 @@ class Wire:
         # The line is in use until the last byte has been sent.
         await asyncio.sleep(sent - asyncio.get_running_loop().time())
         return sent
+
+    async def _drain(self) -> bool:
+        """Wait for the late reply to a request that has timed out, on a slow line.
+
+        Returns whether one may still come: then the next reply may be that one, and
+        its round trip is not measured.
+        """
+        unanswered, loop = self._unanswered, asyncio.get_running_loop()
+        if unanswered is None:
+            return False
+        wait = unanswered.timed_out_at + self.round_trip.drain - loop.time()
+        if wait > 0:
+            await asyncio.sleep(wait)
+        if loop.time() - unanswered.sent_at > self.round_trip.longest:
+            self._unanswered = None
+        return self._unanswered is not None
+
+    def _measure(self, round_trip: float) -> None:
+        before = self.round_trip.timeout
+        self.round_trip.measure(round_trip)
+        if self.round_trip.timeout != before:
+            self.on_timeout_changed()
+
+    def _is_late(self, frame: Frame) -> bool:
+        """Return whether a frame is the late reply; its contents are not used."""
+        unanswered = self._unanswered
+        if unanswered is None or not unanswered.accepts(frame):
+            return False
+        self._unanswered = None
+        self.statistics.late += 1
+        now = asyncio.get_running_loop().time()
+        self._measure(now - unanswered.sent_at)
+        return True
 
     async def _silence(self) -> None:
         """Wait until the line has been quiet for as long as the protocol requires."""
@@ -182,6 +227,8 @@ class Wire:
 
     def _on_frame(self, frame: Frame) -> None:
         if self._pending is not None and self._pending.offer(frame):
+            return
+        if self._is_late(frame):
             return
         if self.on_unsolicited(frame):
             self.statistics.unsolicited += 1
@@ -247,6 +294,22 @@ class Turn:
         LineBusyError and LineLostError.
         """
         return await self._wire.send(request)
+
+
+@dataclass(frozen=True, slots=True)
+class _Unanswered:
+    """A request that has timed out, and whose reply may still come."""
+
+    accept: Callable[..., object | None]
+    sent_at: float
+    timed_out_at: float
+
+    def accepts(self, frame: Frame) -> bool:
+        """Return whether a frame is its reply, a refusal included."""
+        try:
+            return self.accept(frame) is not None
+        except EvseError:
+            return True
 
 
 class _PendingReply:

@@ -36,6 +36,8 @@ class Timing:
     """Longest wait for that quiet time."""
     reply_timeout: float
     """From the end of a request to the first byte of its reply."""
+    reply_timeout_limit: float = 3.0
+    """Longest reply time-out on a line whose replies take longer."""
     gap: float = 0.1
     """Longest pause inside a reply (adapters deliver in chunks)."""
     longest_reply: int

@@ -26,6 +26,8 @@ class BusStatistics:
     sent_only: int = 0
     """Frames without a reply: broadcasts, acknowledgements."""
     timeouts: int = 0
+    late: int = 0
+    """Replies that came after their time-out; they lengthen it, and are not used."""
     retries: int = 0
     merged: int = 0
     """Limits that a newer one replaced before they were sent."""

@@ -17,7 +17,7 @@ TIMING: Final = Timing(
     retry_pauses=(0.3, 1.0),
 )
 """On RS-232."""
-TCP_TIMING: Final = replace(TIMING, reply_timeout=2.0, gap=2.0)
+TCP_TIMING: Final = replace(TIMING, reply_timeout=2.0, reply_timeout_limit=5.0, gap=2.0)
 """Over the network. The gap is the manual's own for TCP."""
 
 COMMAND_TIMEOUT: Final = 30.0

@@ -1,5 +1,6 @@
 """SmartEVSE v2: Modbus RTU on RS-485, polled or with us as load-balancing master."""
 
+from dataclasses import replace
 import re
 from typing import Final
 
@@ -61,7 +62,8 @@ MASTER: Final = Protocol(
     make=_MAKE,
     choice="master",
     settings=SETTINGS,
-    timing=TIMING,
+    # A reply must leave room for the broadcast every 2 s.
+    timing=replace(TIMING, reply_timeout_limit=0.6),
     framer=RtuFramer,
     config=SlaveConfig,
     charger=SlaveSmartEvse,
