@@ -2,6 +2,7 @@
 
 import asyncio
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 import socket
 from types import MappingProxyType
@@ -279,7 +280,9 @@ async def test_a_new_address_makes_the_charger_anew(hass: HomeAssistant) -> None
         )
         await get_entity(hass, "sensor", entry, "1_status")
         assert managed.charger.config.address == 2
-        assert managed.charger.orders == orders
+        assert replace(managed.charger.orders, remembered={}) == replace(
+            orders, remembered={}
+        )
         assert list(entry.runtime_data.bus.chargers) == ["abl1"]
         await hass.config_entries.async_unload(entry.entry_id)
 

@@ -141,3 +141,13 @@ async def test_a_port_lost_meanwhile() -> None:
         scene.virtual.unplug()
         with pytest.raises(LineLostError):
             await scanned
+
+
+@pytest.mark.usefixtures("few_ids")
+@pytest.mark.parametrize("later", [0.008, 0.015, 0.02, 0.03, 0.05, 0.1])
+async def test_a_second_box_that_replies_later_is_a_duplicate(later: float) -> None:
+    slower = AblBox(1, serial="2W22xy00000099", turn_round=later)
+    async with Scene(box(1), slower) as scene:
+        result = await scan(scene)
+        assert result.duplicates == (1,)
+        assert not result.found

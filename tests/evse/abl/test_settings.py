@@ -90,6 +90,18 @@ async def test_an_invalid_device_id_is_refused(value: object) -> None:
         assert scene.writes() == []
 
 
+async def test_a_device_id_with_an_unreadable_reply_is_in_use() -> None:
+    box = box_with()
+    other = AblBox(2, serial="2W22xy00000002")
+    async with Scene(box, other) as scene:
+        charger = await scene.settled(config(), orders())
+        # Two boxes whose replies collide.
+        answers(other, *[b">02030401\xff\xff\r\n"] * 4)
+        with pytest.raises(DuplicateAddressError):
+            await charger.command(Command.SET_ADDRESS, 2)
+        assert scene.writes() == []
+
+
 async def test_no_settings_with_a_car_or_without_a_serial_number() -> None:
     car = sleepy()
     box = box_with(car)

@@ -13,13 +13,14 @@ from ..modbus import ModbusFrame
 from ..model import ChargerConfig, Orders
 from ..protocol import Progress
 from ..readings import ChargerInfo
+from ..registers import Registers
 from ..scan import FoundCharger, ScanResult
-from .reader import read
 from .readings import charger_info
 from .registers import (
     ADDRESSES,
     INFO,
     SERIAL,
+    Serial,
     read_answer,
     read_request,
 )
@@ -111,40 +112,56 @@ async def _read_info(address: int, turn: Turn) -> ChargerInfo:
     differ: that reply is then unreadable, or there are two. Raises GarbledReplyError
     in both cases.
     """
-    info = await read(turn, address, INFO)
-    serials = await _read_serials(turn, address)
-    if len(serials) > 1:
-        message = f"device-ID {address} has {len(serials)} serial numbers"
+    infos = await _collect(turn, address, INFO)
+    serials = {serial.number for serial in await _read_serials(turn, address)}
+    if len(infos) > 1 or len(serials) > 1:
+        message = f"several replies from device-ID {address}: {len(serials)} serials"
         raise GarbledReplyError(message)
-    return charger_info(info, serials.pop() if serials else None, None)
+    return charger_info(infos[0], serials.pop() if serials else None, None)
 
 
-async def _read_serials(turn: Turn, address: int) -> set[str | None]:
+async def _read_serials(turn: Turn, address: int) -> list[Serial]:
     """Return all serial numbers at a device-ID; none where the register is missing.
 
-    No reply ends the exchange, so that the reply of a second, slightly slower box is
-    collected as well.
+    A disturbed exchange is repeated: what could be read may be the slower of two boxes.
+    Raises GarbledReplyError when each one is.
     """
-    serials: set[str | None] = set()
-    answer = read_answer(address, SERIAL.block)
+    for attempt in range(ATTEMPTS):
+        try:
+            return await _collect(turn, address, SERIAL, disturbed=False)
+        except GarbledReplyError:
+            if attempt + 1 == ATTEMPTS:
+                raise
+        except ReplyTimeoutError:
+            pass
+    return []
+
+
+async def _collect[T](
+    turn: Turn, address: int, registers: Registers[T], *, disturbed: bool = True
+) -> list[T]:
+    """Return all replies to one read: no reply ends the exchange.
+
+    So that of a second, slower box is among them, and cannot fall into the next
+    exchange. ``disturbed``: unreadable bytes beside a reply are allowed (a box that
+    wakes up). Raises ReplyTimeoutError where there is none, and GarbledReplyError.
+    """
+    replies: list[T] = []
+    answer = read_answer(address, registers.block)
 
     def collect(frame: ModbusFrame) -> None:
         if (data := answer(frame)) is not None:
-            serials.add(SERIAL.decode(data).number)
+            replies.append(registers.decode(data))
 
-    garbled: GarbledReplyError | None = None
-    for _ in range(ATTEMPTS):
-        try:
-            await turn.exchange(read_request(address, SERIAL.block), collect)
-        except GarbledReplyError as error:
-            garbled = error
-        except ReplyTimeoutError:
-            pass
-        if serials:
-            return serials
-    if garbled is not None:
-        raise garbled
-    return serials
+    try:
+        await turn.exchange(read_request(address, registers.block), collect)
+    except GarbledReplyError:
+        if not (replies and disturbed):
+            raise
+    except ReplyTimeoutError:
+        if not replies:
+            raise
+    return replies
 
 
 async def scan(

@@ -7,11 +7,13 @@ cycles. The box must have been identified by its serial number (PROTOCOLS.md, 2)
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from typing import Final
 
 from ..conversation import rest
 from ..errors import (
     DuplicateAddressError,
     EvseError,
+    GarbledReplyError,
     NotAvailableError,
     NotConfirmedError,
     ReplyTimeoutError,
@@ -30,6 +32,9 @@ from .steps import (
     rest_without_polls,
     restore,
 )
+
+SILENT_READS: Final = 4
+"""Reads of a device-ID that prove it free: two pairs."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,13 +102,17 @@ async def _is_free(reader: AblReader, turn: Turn, address: int) -> bool:
     others = reader.bus.chargers.values() if reader.bus is not None else ()
     if any(other.config.address == address for other in others):
         return False
-    with suppress(ReplyTimeoutError):
-        await read(turn, address, INFO)
-        return False
-    # A sleeping box loses the first request.
-    await rest(reader.pauses.retry)
-    with suppress(ReplyTimeoutError):
-        await read(turn, address, INFO)
+    for attempt in range(SILENT_READS):
+        if attempt:
+            # A sleeping box loses the first request.
+            await rest(reader.pauses.retry)
+        try:
+            await read(turn, address, INFO)
+        except GarbledReplyError:
+            # Perhaps two boxes at once.
+            return False
+        except ReplyTimeoutError:
+            continue
         return False
     return True
 
