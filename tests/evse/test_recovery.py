@@ -8,9 +8,11 @@ from hypothesis import given, settings, strategies as st
 import pytest
 
 from custom_components.evse_bus.evse.errors import LineLostError, PortMissingError
+from custom_components.evse_bus.evse.model import OrderChange
 from custom_components.evse_bus.evse.recovery import PAUSES, SILENCES, LineRecovery
 from tests.simulated_time import now, simulate
 
+from .simulated_line import until
 from .telegram import Device, Scene, TelegramLine
 from .test_master import PERIOD, BeatScene
 
@@ -26,11 +28,14 @@ class Adapter(TelegramLine):
         """It closes a connection without traffic after this time, s."""
         self.silent_connections = False
         """It accepts each connection, delivers nothing, and closes it."""
+        self.opening_time = 0.0
+        """Time that each attempt to open it takes, s."""
         self.opened: list[float] = []
         self._idle: asyncio.TimerHandle | None = None
 
     @override
     async def open(self) -> None:
+        await asyncio.sleep(self.opening_time)
         await super().open()
         self.opened.append(now())
         self.hung = False
@@ -226,5 +231,36 @@ def test_a_line_lost_while_it_worked_is_opened_at_once() -> None:
             adapter.on_lost(LineLostError("idle"))
             await asyncio.sleep(0.1)
             assert adapter.opened[-1] - lost < 0.001
+
+    simulate(scene())
+
+
+@pytest.mark.parametrize("renewed", [False, True])
+def test_a_command_does_not_wait_for_a_port_that_is_away(renewed: bool) -> None:  # noqa: FBT001
+    """A command given while the port is opened again fails with that attempt."""
+
+    async def scene() -> None:
+        bus = Scene(addresses=(1,), interval=1.0)
+        adapter = behind_adapter(bus)
+        async with bus:
+            await asyncio.sleep(5)
+            adapter.opening_time = 4.0
+            adapter.refuse_open = PortMissingError("away")
+            if renewed:
+                adapter.hung = True
+                await until(lambda: not adapter.is_open)
+            else:
+                adapter.unplug()
+            await asyncio.sleep(1)
+            started = now()
+            with pytest.raises(LineLostError):
+                async with asyncio.timeout(60):
+                    await bus.charger(1).change_orders(OrderChange(allowed=True))
+            assert now() - started <= adapter.opening_time
+            adapter.refuse_open = None
+            sent = len(adapter.sent)
+            await asyncio.sleep(20)
+            assert bus.charger(1).available
+            assert "W" not in [one.command for one in adapter.sent[sent:]]
 
     simulate(scene())

@@ -517,6 +517,8 @@ class Bus(Observable):
         """
         while True:
             if self._loss is None and not self._stopping:
+                # Commands may have come while an attempt was under way.
+                self._jobs.fail_all(LineLostError(f"{self.name} is not connected"))
                 pause = self.wire.recovery.next_pause()
                 await self._timer.sleep_until(self.now + pause)
             if self._stopping:
