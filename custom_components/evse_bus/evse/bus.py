@@ -374,11 +374,11 @@ class Bus(Observable):
             charger.plan(self.now)
         except EvseError as error:
             _LOGGER.debug("%s: %s", charger.config.name, error)
-            charger.on_missed(self.now)
-        except Exception:
+            charger.on_missed(self.now, str(error))
+        except Exception as error:
             # A mistake of ours must not end the bus for all other chargers.
             _LOGGER.exception("%s: a poll failed unexpectedly", charger.config.name)
-            charger.on_missed(self.now)
+            charger.on_missed(self.now, repr(error))
         else:
             now = self.now
             charger.on_reply(now)
@@ -478,7 +478,7 @@ class Bus(Observable):
         self.connected = False
         if self.master is not None:
             self.master.slot.start_by = inf
-        self._abandon_chargers()
+        self._abandon_chargers(str(error))
         self.updated()
 
     @property
@@ -502,13 +502,13 @@ class Bus(Observable):
     def silence(self, why: str) -> None:
         """Fail all waiting commands and drop all readings: the bus falls silent."""
         self._jobs.fail_all(NotAvailableError(why))
-        self._abandon_chargers()
+        self._abandon_chargers(why)
         self.reschedule()
 
-    def _abandon_chargers(self) -> None:
+    def _abandon_chargers(self, why: str) -> None:
         for charger in self.chargers.values():
             charger.slot.start_by = inf
-            charger.set_unavailable()
+            charger.set_unavailable(why)
 
     async def _reopen(self) -> bool:
         """Open the port again, however long it takes; False when told to stop.

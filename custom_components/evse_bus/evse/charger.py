@@ -56,6 +56,7 @@ from .safety import (
 )
 from .schedule import Kind, Slot
 from .statistics import ChargerStatistics
+from .throttle import PresenceLog
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -118,6 +119,7 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         """Requests left unanswered in a row."""
         self.available = False
         """It answers, and its reading is up to date."""
+        self._presence = PresenceLog()
         self.noticed: frozenset[Fault] = frozenset()
         """Faults found by this library, beside those the charger reports."""
         self.orders_expired = False
@@ -316,10 +318,13 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         self.slot.served = now
         if not self.available:
             self.available = True
-            _LOGGER.debug("%s answers", self.config.name)
+            self._presence.back(self.config.name)
 
-    def on_missed(self, now: float) -> None:
-        """Take note of an unanswered request; after some in a row: unavailable."""
+    def on_missed(self, now: float, why: str) -> None:
+        """Take note of an unanswered request; after some in a row: unavailable.
+
+        ``why``: the error, for the log.
+        """
         self.misses += 1
         self.slot.kind = Kind.PROBE
         self.slot.start_by = inf
@@ -329,15 +334,20 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         else:
             doubled = 2 ** min(self.misses - self.timing.misses, 16)
             pause = min(self.timing.backoff * doubled, self.timing.backoff_limit)
-            self.set_unavailable()
+            self.set_unavailable(why)
         self.slot.ready = self.slot.due = now + max(pause, self.minimum_pause(now))
 
     def minimum_pause(self, now: float) -> float:  # noqa: ARG002
         """Return the time for which nothing may be sent to it from now on, s."""
         return 0.0
 
-    def set_unavailable(self) -> None:
-        """Drop the reading: a stale value would mislead."""
+    def set_unavailable(self, why: str) -> None:
+        """Drop the reading: a stale value would mislead.
+
+        ``why``: for the log.
+        """
+        now = asyncio.get_running_loop().time()
+        self._presence.gone(self.config.name, why, now)
         was = self.available
         self.available = False
         self.reading = None

@@ -10,7 +10,7 @@ _LOGGER = logging.getLogger(__name__)
 
 LOSSES: Final = 20
 LOSSES_WINDOW: Final = 3600.0
-"""LogThrottle logged as warnings within this time, s: a dialling box can come and go."""
+"""Losses of one line or charger logged at full level within this time, s."""
 
 _LOST: Final = {
     False: "%s: the port was lost (%s), trying again",
@@ -35,6 +35,33 @@ class RateLimiter:
             return False
         taken.append(now)
         return True
+
+
+class PresenceLog:
+    """Logs when one charger goes and when it returns, once each.
+
+    At info: that a charger is off may be quite in order.
+    """
+
+    def __init__(self) -> None:
+        """Nothing is known of it yet."""
+        self._limiter = RateLimiter(LOSSES, LOSSES_WINDOW)
+        self._level = logging.INFO
+        self._gone = False
+
+    def gone(self, name: str, why: str, now: float) -> None:
+        """Log that it is unavailable, unless it was; ``now``: loop time, s."""
+        if self._gone:
+            return
+        self._gone = True
+        self._level = logging.INFO if self._limiter.take(now) else logging.DEBUG
+        _LOGGER.log(self._level, "%s is unavailable: %s", name, why)
+
+    def back(self, name: str) -> None:
+        """Log that it answers, at the level of its absence; the first time at debug."""
+        level = self._level if self._gone else logging.DEBUG
+        self._gone = False
+        _LOGGER.log(level, "%s is available: it answers", name)
 
 
 class LogThrottle:

@@ -202,8 +202,8 @@ class AblReader(Charger[AblConfig]):
         self._energy.interrupt()
 
     @override
-    def on_missed(self, now: float) -> None:
-        super().on_missed(now)
+    def on_missed(self, now: float, why: str) -> None:
+        super().on_missed(now, why)
         self._forget()
         # The next reply may come from another box.
         self._identified = False
@@ -237,9 +237,9 @@ class AblReader(Charger[AblConfig]):
         expected = self.config.serial or self._serial
         if expected is not None and serial != expected:
             self.notice(Fault.WRONG_CHARGER, present=True)
-            self.set_unavailable()
             found = serial or "no serial number"
             message = f"found {found} at device-ID {address}, expected {expected}"
+            self.set_unavailable(message)
             raise WrongChargerError(message, expected=expected, found=found)
         self.notice(Fault.WRONG_CHARGER, present=False)
         if serial != self._serial:

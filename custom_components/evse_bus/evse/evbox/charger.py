@@ -309,11 +309,12 @@ class EvboxCharger(Charger[EvboxConfig]):
             self._other_serial = found
             message = f"serial number {found} instead of {expected}"
             raise ImplausibleReplyError(message)
-        message = f"{self.config.name}: serial number {found} instead of {expected}"
+        why = f"serial number {found} instead of {expected}"
+        message = f"{self.config.name}: {why}"
         _LOGGER.warning("%s; nothing more is sent to it", message)
         self._wrong_charger = WrongChargerError(message, expected=expected, found=found)
         self.notice(Fault.WRONG_CHARGER, present=True)
-        self.set_unavailable()
+        self.set_unavailable(why)
         self._stop()
         self.updated()
         raise self._wrong_charger
@@ -327,7 +328,7 @@ class EvboxCharger(Charger[EvboxConfig]):
             self.notice(Fault.IMPLAUSIBLE, present=True)
             self.updated()
         if self._implausible >= self.timing.misses and self.available:
-            self.set_unavailable()
+            self.set_unavailable("implausible replies only")
 
     def _on_accepted(self, accepted: AcceptedReply, now: float) -> None:
         self._implausible = 0
@@ -416,9 +417,9 @@ class EvboxCharger(Charger[EvboxConfig]):
         slot.start_by = max(slot.start_by, slot.ready)
 
     @override
-    def on_missed(self, now: float) -> None:
+    def on_missed(self, now: float, why: str) -> None:
         """Retry after the minimum interval, and still before the time-out."""
-        super().on_missed(now)
+        super().on_missed(now, why)
         if self._wrong_charger is not None:
             self._stop()
         elif self.available and self._deadline >= self.slot.ready:

@@ -160,7 +160,7 @@ class BoxPort(Charger[EwsPortConfig]):
         is_wrong = expected is not None and found != expected
         self.notice(Fault.WRONG_CHARGER, present=is_wrong)
         if is_wrong and found is not None:
-            self.set_unavailable()
+            self.set_unavailable("another box answers")
             self.group.on_wrong_box()
             message = f"{self.config.name}: another box answers"
             raise WrongChargerError(message, expected=expected, found=found)
@@ -207,8 +207,9 @@ class BoxPort(Charger[EwsPortConfig]):
         missing = installation is not None and installation.ports < self.number
         self.notice(Fault.NO_SUCH_PORT, present=missing)
         if len(self.box.ports) < self.number:
-            self.set_unavailable()
-            message = f"{self.config.name}: the box has no port {self.number}"
+            why = f"the box has no port {self.number}"
+            self.set_unavailable(why)
+            message = f"{self.config.name}: {why}"
             raise NotAvailableError(message)
 
     # -- Orders to it ----------------------------------------------------------------
@@ -249,8 +250,8 @@ class BoxPort(Charger[EwsPortConfig]):
             self.group.port_is_back()
 
     @override
-    def on_missed(self, now: float) -> None:
-        super().on_missed(now)
+    def on_missed(self, now: float, why: str) -> None:
+        super().on_missed(now, why)
         self._set_deadline(now)
 
     def _set_deadline(self, now: float) -> None:

@@ -125,7 +125,7 @@ class EwsReader(BoxPort):
         if self._implausible >= IMPLAUSIBLE_REPLIES:
             self._implausible = 0
             self.notice(Fault.IMPLAUSIBLE, present=True)
-            self.set_unavailable()
+            self.set_unavailable("implausible replies only")
 
     def _update_info(self) -> None:
         box, info = self.box.status, self.info

@@ -160,8 +160,8 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
         self._written = None
 
     @override
-    def on_missed(self, now: float) -> None:
-        super().on_missed(now)
+    def on_missed(self, now: float, why: str) -> None:
+        super().on_missed(now, why)
         # It may have been switched off and on again.
         self._written = None
 

@@ -148,8 +148,8 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
         self._plug_hidden_until = 0.0
 
     @override
-    def on_missed(self, now: float) -> None:
-        super().on_missed(now)
+    def on_missed(self, now: float, why: str) -> None:
+        super().on_missed(now, why)
         # The next reply may be another box's: read it before anything is written.
         self.status = None
 
@@ -200,8 +200,8 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
         expected = self.config.serial or self._serial
         if expected is not None and status.serial != expected:
             self.notice(Fault.WRONG_CHARGER, present=True)
-            self.set_unavailable()
             found = status.serial or "no serial number"
+            self.set_unavailable(f"{found} answers, not {expected}")
             message = f"{self.config.name}: {found} answers, not {expected}"
             raise WrongChargerError(message, expected=expected, found=found)
         self.notice(Fault.WRONG_CHARGER, present=False)
@@ -280,7 +280,7 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
         """Drop what is known of a box that does not reply as it did before."""
         self._implausible_replies = 0
         self.notice(Fault.IMPLAUSIBLE, present=True)
-        self.set_unavailable()
+        self.set_unavailable("its replies are not those of its firmware")
 
     def on_status(self, status: Status, now: float) -> None:
         """Accept a status, and make a reading of it."""

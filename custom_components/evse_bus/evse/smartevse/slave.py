@@ -63,6 +63,7 @@ ROUNDS: Final = 2
 OTHER_DIALECT_INTERVAL: Final = 30.0
 """Pause between two readings of a box of another dialect, s."""
 
+_OTHER_HANDSHAKE: Final = "its firmware has another handshake"
 _ANSWER_BYTES: Final = LONGEST_REQUEST
 """A turn that answers may have a broadcast instead."""
 _FOR_CURRENT: Final = frozenset({RequestKind.B, RequestKind.C})
@@ -266,12 +267,12 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
         self.has_other_dialect = self.dialect is not Dialect.V2_17
         if self.has_other_dialect:
             self._read_dialect_at = turn.now + OTHER_DIALECT_INTERVAL
-            self.set_unavailable()
+            self.set_unavailable(_OTHER_HANDSHAKE)
             self.notice(Fault.UNSUPPORTED_FIRMWARE, present=True)
             raise self._refusal()
 
     def _refusal(self) -> NotAvailableError:
-        message = f"{self.config.name}: its firmware has another handshake"
+        message = f"{self.config.name}: {_OTHER_HANDSHAKE}"
         return NotAvailableError(message)
 
     @override
@@ -316,8 +317,8 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
             self.notice(Fault.LIMIT_NOT_TAKEN, present=True)
 
     @override
-    def on_missed(self, now: float) -> None:
-        super().on_missed(now)
+    def on_missed(self, now: float, why: str) -> None:
+        super().on_missed(now, why)
         self.master.on_missed(self.unit)
 
     # -- Access --------------------------------------------------------------------
