@@ -91,6 +91,7 @@ async def test_abl_boxes_are_found_and_added(hass: HomeAssistant) -> None:
         "order_lifetime": None,
         "fail_safe_current": 6,
         "phase_order": [3, 2, 1],
+        "enable_again": False,
     }
     assert (right.title, right.unique_id) == ("Right", "abl_2W22xy00000016")
     assert right.data["address"] == 16

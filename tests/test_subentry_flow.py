@@ -272,7 +272,12 @@ async def test_abl_charger_is_changed_in_place(hass: HomeAssistant) -> None:
             "device_id": "1",
             "serial": serial(1),
             "installation_limit": 16,
-            "expert": {"poll_interval": 0.1, "voltage": 230, "phase_order": "123"},
+            "expert": {
+                "poll_interval": 0.1,
+                "voltage": 230,
+                "phase_order": "123",
+                "enable_again": False,
+            },
         }
         await flow.submit(changed(device_id="2"))
         assert flow.errors == {"device_id": "address_taken"}
@@ -288,7 +293,7 @@ async def test_abl_charger_is_changed_in_place(hass: HomeAssistant) -> None:
             changed(
                 name="Car port",
                 installation_limit=10,
-                expert=expert | {"phase_order": "312"},
+                expert=expert | {"phase_order": "312", "enable_again": True},
             )
         )
         assert flow.result["reason"] == "reconfigure_successful"
@@ -305,6 +310,7 @@ async def test_abl_charger_is_changed_in_place(hass: HomeAssistant) -> None:
             "order_lifetime": 30,
             "fail_safe_current": 6,
             "phase_order": [3, 1, 2],
+            "enable_again": True,
         }
         running = entry.runtime_data.bus.chargers[one.subentry_id]
         assert running.config.installation_limit == 10

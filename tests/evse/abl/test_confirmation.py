@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, Phase, given, settings, strategies as st
 import pytest
 
 from custom_components.evse_bus.evse.abl import AblCharger
-from custom_components.evse_bus.evse.errors import EvseError
+from custom_components.evse_bus.evse.errors import EvseError, NotAvailableError
 from custom_components.evse_bus.evse.model import (
     Command,
     Fault,
@@ -236,6 +236,65 @@ async def test_a_pause_by_another_after_ours_is_not_ours() -> None:
         before = len(scene.writes())
         await charger.change_orders(limit(8))
         assert scene.writes()[before:] == []
+
+
+# -- E0 by itself ----------------------------------------------------------------------
+
+A1 = 0xA1A1
+
+
+async def long_pause(box: AblBox, scene: Scene, **options: Any) -> AblCharger:  # noqa: ANN401
+    box.outlet.e0_after_pause = 40.0
+    charger = await begun(scene, orders(10, allowed=True))
+    charger._config = replace(charger.config, **options)
+    await charger.change_orders(OFF)
+    await asyncio.sleep(90)
+    assert box.state == "E0"
+    return charger
+
+
+async def test_allow_enables_an_outlet_disabled_by_a_long_pause() -> None:
+    box = box_of_16_a(plugged())
+    async with Scene(box) as scene:
+        charger = await long_pause(box, scene, enable_again=True)
+        await asyncio.sleep(60)
+        await charger.change_orders(limit(8))
+        assert box.state == "E0"
+        before = len(scene.writes())
+        await charger.change_orders(ON)
+        # The limit first.
+        assert scene.writes()[before:] == [133, A1]
+        await until(lambda: box.state == "C2")
+
+
+async def test_without_the_option_the_outlet_stays_disabled() -> None:
+    box = box_of_16_a(plugged())
+    async with Scene(box) as scene:
+        charger = await long_pause(box, scene)
+        with pytest.raises(NotAvailableError, match="enable it first"):
+            await charger.change_orders(ON)
+        assert A1 not in scene.writes()
+
+
+@pytest.mark.parametrize("how", ["input", "flag", "missed", "locked"])
+async def test_an_e0_that_may_have_come_otherwise_stays(how: str) -> None:
+    box = box_of_16_a(plugged())
+    if how == "input":
+        box.outlet.enable_input = 1
+    if how == "flag":
+        box.outlet.e0_a1_enabled = False
+    async with Scene(box) as scene:
+        charger = await long_pause(box, scene, enable_again=True)
+        if how == "missed":
+            box.faults.once("lose")
+            await asyncio.sleep(10)
+        if how == "locked":
+            box.outlet.e0_after_pause = None
+            await charger.command(Command.SET_OUTLET, value=True)
+            await charger.command(Command.SET_OUTLET, value=False)
+        with pytest.raises(NotAvailableError, match="enable it first"):
+            await charger.change_orders(ON)
+        assert box.state == "E0"
 
 
 # -- Sleep -----------------------------------------------------------------------------

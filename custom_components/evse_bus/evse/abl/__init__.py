@@ -7,7 +7,7 @@ from typing import Final
 from ..address import NumberAddress
 from ..framing import LineSettings
 from ..modbus import AsciiFramer
-from ..options import Choice
+from ..options import Choice, Toggle
 from ..protocol import Make, Protocol
 from ..redaction import SerialNumbers
 from .charger import AblCharger
@@ -39,7 +39,7 @@ PROTOCOL: Final = Protocol(
     charger=AblCharger,
     scan=scan,
     address=NumberAddress(key="device_id", lowest=1, highest=16),
-    options=(_PHASE_ORDER,),
+    options=(_PHASE_ORDER, Toggle(name="enable_again")),
     serials=_SERIALS,
 )
 

@@ -28,9 +28,9 @@ from .config import AblConfig
 from .decisions import FAILED_AFTER, WRITE_PAUSES, Decision, believed_paused
 from .duty import PAUSE
 from .reader import ICMAX_PROBES, AblReader
-from .registers import Reading, limit_duty
-from .states import E0, SETUP, is_failure
-from .steps import restore
+from .registers import Reading, StateCode, limit_duty
+from .states import E0, E2, SETUP, is_failure
+from .steps import reach_state, restore
 
 GARBLED_REPLIES: Final = 3
 """Unreadable replies in a row that suggest two boxes with one device-ID."""
@@ -171,7 +171,8 @@ class AblCharger(AblReader):
                 # A pause by the user waits for no other exchange.
                 status = await self.read_status(turn)
                 await self._require_icmax(turn, status)
-            if change.allowed is True:
+            enables = change.allowed is True and self.may_enable_again
+            if change.allowed is True and not enables:
                 self._require_startable(status)
             if change.allowed is False:
                 await self.note_pause(by_limit=False)
@@ -188,6 +189,10 @@ class AblCharger(AblReader):
                 lambda: clamp(self.order_to_send(change), self.limits),
                 starts=change.allowed is True or ends_own_pause,
             )
+            if enables and not clamp(self.order_to_send(change), self.limits).paused:
+                await reach_state(
+                    self, turn, StateCode.A1, lambda now: now.state not in (E0, E2)
+                )
             self._fell_back = False
             if change.allowed is True:
                 self.allowed_by_user = True

@@ -1,7 +1,7 @@
 """Configuration and timing of an ABL wallbox."""
 
 from dataclasses import dataclass
-from typing import Final
+from typing import ClassVar, Final
 
 from ..framing import Timing
 from ..model import ChargerConfig, Phases
@@ -40,6 +40,12 @@ class AblConfig(ChargerConfig):
     """s; keeps the box awake, and shows soon that a power cycle has reset the limit."""
     phase_order: Phases[int] = (3, 2, 1)
     """The phase that each of Ict1, Ict2, Ict3 measures; most boxes begin with L3."""
+
+    enable_again: bool = False
+    """The user's permission also enables an outlet that went to E0 by itself, out of a
+    pause of ours."""
+
+    live: ClassVar = ChargerConfig.live | {"enable_again"}
 
     def __post_init__(self) -> None:
         """Raise ValueError unless the phase order has each phase once."""

@@ -83,6 +83,9 @@ ICMAX_PROBES: Final = 3
 ICMAX_ABSENT: Final = 600.0
 """Time after which that is tried again, s."""
 
+E0_OURS: Final = 60.0
+"""An E0 so soon after a request for it is no E0 by itself, s."""
+
 REPORTS_ICMAX: Final = "reports_icmax"
 """Note with the orders: serial number of the box that has answered 0x000F."""
 PAUSED_BY_LIMIT: Final = "paused_by_limit"
@@ -146,6 +149,9 @@ class AblReader(Charger[AblConfig]):
         """Our limit of 0 A has paused it, and no reply was missed since."""
         self.pending_cleanup: Cleanup | None = None
         """State that a command brought about and has not ended yet."""
+        self.paused_into_e0 = False
+        """It was seen to go to E0 by itself, out of a confirmed pause of ours."""
+        self._e0_sent_at = -inf
         self._serial: str | None = None
         self._info: Info | None = None
         self._flags: Flags | None = None
@@ -215,7 +221,7 @@ class AblReader(Charger[AblConfig]):
     def _forget(self) -> None:
         """Drop what a power cut or another master may have changed unseen."""
         self.missed = True
-        self.allowed_by_user = self.limit_paused = False
+        self.allowed_by_user = self.limit_paused = self.paused_into_e0 = False
         self.writes.forget()
         self._icmax_silent = 0
 
@@ -296,6 +302,7 @@ class AblReader(Charger[AblConfig]):
 
     def keep_status(self, status: Reading, now: float) -> None:
         """Keep a status read at a loop time (s), and make the reading of it."""
+        self._note_e0(status.state, now)
         self._note_state(status.state, now)
         self.last_status = status
         self._status_at = now
@@ -319,6 +326,34 @@ class AblReader(Charger[AblConfig]):
         self.reading = reading
         if changed:
             self.updated()
+
+    def _note_e0(self, state: int, now: float) -> None:
+        before = self.last_status
+        if state != E0 or before is None:
+            self.paused_into_e0 = False
+        elif before.state != E0:
+            confirmed = self.order_state is OrderState.CONFIRMED
+            self.paused_into_e0 = (
+                self.code == PAUSE
+                and confirmed
+                and not self.missed
+                and now - self._e0_sent_at > E0_OURS
+            )
+
+    @property
+    def may_enable_again(self) -> bool:
+        """Return whether the user's permission may end an E0 that it went to by itself.
+
+        Not where an enable input or the box itself has a say in it.
+        """
+        return (
+            self.config.enable_again
+            and self.paused_into_e0
+            and self._flags is not None
+            and not self._flags.e0_a1_disabled
+            and self._info is not None
+            and self._info.enable_input == "none"
+        )
 
     def _note_state(self, state: int, now: float) -> None:
         charging = not (state in IDLE | SETUP or is_failure(state))
@@ -558,6 +593,8 @@ class AblReader(Charger[AblConfig]):
 
         A reply that stays away decides nothing: the state has to be read.
         """
+        if code is StateCode.E0:
+            self._e0_sent_at = turn.now
         try:
             await turn.exchange(
                 write_state(self.config.address, code),
