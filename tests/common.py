@@ -25,6 +25,7 @@ from homeassistant.helpers.event import async_track_state_change_event
 from pytest_homeassistant_custom_component.common import MockConfigEntry
 
 from custom_components.evse_bus.const import DOMAIN, SUBENTRY_CHARGER
+from custom_components.evse_bus.energy import TOTALS, TOTALS_KEY, TotalStore
 from custom_components.evse_bus.issues import report_orders_written
 from custom_components.evse_bus.orders import (
     KNOWN_KEY,
@@ -38,7 +39,7 @@ from tests.virtual import AblBox, EvboxChargePoint, SmartEvse, VirtualBus
 from tests.virtual.device import Device
 from tests.virtual.ews_box import EwsBox
 
-FILES = (ORDERS_KEY, KNOWN_KEY)
+FILES = (ORDERS_KEY, KNOWN_KEY, TOTALS_KEY)
 PATIENCE = 15.0
 """Longest time a virtual charger may take to be seen, s."""
 
@@ -191,12 +192,15 @@ async def shut_down(hass: HomeAssistant, entry: MockConfigEntry) -> None:
 
 
 def forget_orders(hass: HomeAssistant) -> None:
-    """Drop all orders from memory, also those that are not written yet."""
+    """Drop all orders and totals from memory, also those that are not written yet."""
     store = hass.data.get(ORDERS)
     if store is not None:
         store._stop_timer()
         store._pending = False
     hass.data[ORDERS] = OrderStore(hass, partial(report_orders_written, hass))
+    if (totals := hass.data.get(TOTALS)) is not None:
+        totals._stop_timer()
+    hass.data[TOTALS] = TotalStore(hass)
 
 
 def stored_order(

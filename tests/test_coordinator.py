@@ -62,6 +62,8 @@ async def test_a_chargepoint_swapped_for_another(hass: HomeAssistant) -> None:
             hass, "evbox", bus.url, charger("evbox", 0, poll_interval=0.5)
         )
         maximum = await get_entity(hass, "sensor", entry, "maximum_current")
+        # Two replies have to agree on it, as on the serial number.
+        await wait_for_state(hass, maximum, "35.0")
         await hass.async_block_till_done()
         assert entry.subentries["evbox0"].data["serial"] == "1923054"
         box.serial = "01923055"

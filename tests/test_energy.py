@@ -1,26 +1,57 @@
 """Energy totals: they grow by what has flowed, and by nothing else."""
 
+from collections.abc import Callable
 from datetime import timedelta
+from typing import Any
+from unittest.mock import patch
 
-from homeassistant.core import HomeAssistant, State
+from homeassistant.const import EVENT_HOMEASSISTANT_FINAL_WRITE
+from homeassistant.core import (
+    Event,
+    EventStateChangedData,
+    HomeAssistant,
+    State,
+    callback,
+)
+from homeassistant.helpers import issue_registry as ir
 from homeassistant.util import dt as dt_util
 from hypothesis import given, strategies as st
-from pytest_homeassistant_custom_component.common import (
-    mock_restore_cache_with_extra_data,
-)
+import pytest
+from pytest_homeassistant_custom_component.common import async_fire_time_changed
 
-from custom_components.evse_bus.energy import HIGHEST_POWER, MeterTotal, SummedTotal
-from tests.common import get_entity, running, wait_for_state
+from custom_components.evse_bus import energy as energy_module
+from custom_components.evse_bus.const import DOMAIN
+from custom_components.evse_bus.energy import (
+    INTERVAL,
+    PATIENCE,
+    STEP,
+    TOTALS_KEY,
+    Clocks,
+    MeterRecord,
+    MeterTotal,
+    SummedTotal,
+    TotalStore,
+)
+from custom_components.evse_bus.evse.meter import most_energy
+from custom_components.evse_bus.storage import StoredFile
+from tests.common import crash, get_entity, running, shut_down, wait_for_state
 from tests.virtual import AblBox, Car, EvboxChargePoint, Module
 
 meters = st.floats(0, 1e9)
+NOW = Clocks(monotonic=50.0, wall=1_000_000.0)
+DAY = 86_400.0
+
+
+def later(seconds: float, *, corrected: float = 0.0) -> Clocks:
+    """Return the clocks after a time; the wall clock was corrected meanwhile."""
+    return Clocks(NOW.monotonic + seconds, NOW.wall + seconds + corrected)
 
 
 @given(meters, meters)
 def test_the_first_meter_is_shown_as_it_is(first: float, rise: float) -> None:
     total = MeterTotal()
-    assert total.update(first, 0) == first
-    assert total.update(first + rise, 0) == first + rise
+    assert total.update(first, 0, NOW) == first
+    assert total.update(first + rise, 0, NOW) == first + rise
 
 
 @given(meters, st.lists(st.tuples(meters, st.integers(0, 3)), min_size=1))
@@ -28,10 +59,10 @@ def test_another_meter_never_makes_a_step(
     first: float, readings: list[tuple[float, int]]
 ) -> None:
     total = MeterTotal()
-    shown = total.update(first, 0)
+    shown = total.update(first, 0, NOW)
     before = {0: first}
     for meter, generation in readings:
-        previous, shown = shown, total.update(meter, generation)
+        previous, shown = shown, total.update(meter, generation, NOW)
         # A generation that is resumed has counted since its own last value, at most.
         growth = max(meter - before.get(generation, meter), 0.0)
         assert 0 <= shown - previous <= growth + 1e-6 * (1 + meter + shown)
@@ -40,22 +71,62 @@ def test_another_meter_never_makes_a_step(
 
 def test_a_meter_that_reads_zero_for_a_while_is_counted_once() -> None:
     total = MeterTotal()
-    assert total.update(5000, 0) == 5000
-    assert total.update(0, 1) == 5000
-    assert total.update(30, 1) == 5030
-    assert total.update(5050, 0) == 5050
-    assert total.update(5060, 0) == 5060
+    assert total.update(5000, 0, NOW) == 5000
+    assert total.update(0, 1, NOW) == 5000
+    assert total.update(30, 1, NOW) == 5030
+    assert total.update(5050, 0, NOW) == 5050
+    assert total.update(5060, 0, NOW) == 5060
 
 
-@given(meters, meters, st.floats(0, 1e7))
+@given(meters, meters, meters, st.floats(-1e7, 1e7), st.floats(6.0, 80.0))
 def test_after_a_restart_only_what_can_have_flowed(
-    kept: float, meter: float, away: float
+    kept: float, before: float, meter: float, away: float, current: float
 ) -> None:
-    total = MeterTotal(total=kept)
-    shown = total.update(meter, 0, away)
-    assert 0 <= shown - kept <= HIGHEST_POWER * away / 3600 + 1 + 1e-6 * kept
-    if 0 <= meter - kept <= HIGHEST_POWER * away / 3600:
-        assert shown == meter
+    total = MeterTotal(MeterRecord(kept, before, NOW.wall - away))
+    shown = total.update(meter, 0, NOW, current)
+    growth = shown - kept
+    most = most_energy(away, current)
+    assert 0 <= growth <= most + 1e-6 * (1 + kept + most)
+    assert growth == pytest.approx(
+        meter - before if 0 <= meter - before <= most else 0.0,
+        abs=1e-6 * (1 + kept + meter),
+    )
+    # What is not counted is reported in the end.
+    total.update(meter, 0, later(PATIENCE), current)
+    assert (total.not_counted is not None) is not (0 <= meter - before <= most)
+
+
+def test_a_computer_that_starts_with_the_time_of_yesterday_loses_nothing() -> None:
+    """22 kWh were charged while it was off."""
+    stored = MeterRecord(100_000, 40_000, NOW.wall + DAY - 4 * 3600)
+    total = MeterTotal(stored)
+    assert total.update(62_000, 0, NOW) == 100_000
+    assert total.update(62_010, 0, later(20)) == 100_010
+    # A restart in the meantime decides nothing.
+    assert total.record(later(20)) == MeterRecord(100_010, 40_010, stored.wall)
+    assert total.update(62_020, 0, later(40, corrected=DAY)) == 122_020
+    assert total.not_counted is None
+    # The step is counted once.
+    assert total.update(62_030, 0, later(60, corrected=DAY)) == 122_030
+    assert total.record(later(60)) == MeterRecord(
+        122_030, 62_030, later(60).wall, later(60).monotonic
+    )
+
+
+def test_a_wall_clock_that_is_never_corrected_is_reported() -> None:
+    total = MeterTotal(MeterRecord(100_000, 40_000, NOW.wall))
+    total.update(62_000, 0, NOW)
+    assert total.not_counted is None
+    assert total.update(62_000, 0, later(PATIENCE)) == 100_000
+    assert total.not_counted == 22_000
+
+
+def test_a_reload_goes_by_the_monotonic_clock() -> None:
+    total = MeterTotal()
+    total.update(5000, 0, NOW)
+    # The wall clock is set back by a day while nothing is read for an hour.
+    total = MeterTotal(total.record(NOW))
+    assert total.update(15_000, 0, later(3600, corrected=-DAY)) == 15_000
 
 
 def test_a_sum_goes_on_when_its_source_begins_anew() -> None:
@@ -66,67 +137,142 @@ def test_a_sum_goes_on_when_its_source_begins_anew() -> None:
     assert total.update(1.0, "two") == 110.0
 
 
-async def test_estimated_energy_goes_on_after_a_restart(hass: HomeAssistant) -> None:
-    mock_restore_cache_with_extra_data(
-        hass,
-        [
-            (
-                State("sensor.charger_1_estimated_energy", "12.5"),
-                {"native_value": 12500.0, "native_unit_of_measurement": "Wh"},
-            )
-        ],
-    )
+async def test_estimated_energy_survives_a_crash(
+    hass: HomeAssistant,
+    hass_storage: dict[str, Any],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Nothing is shown before it is stored, so it never falls."""
+    monkeypatch.setattr(energy_module, "STEP", 0.05)
+    monkeypatch.setattr(energy_module, "INTERVAL", 0.1)
     car = Car(reaction=0.0, ramp=0.1)
     async with running(hass, AblBox(1, car=car)) as (entry, _):
         energy = await get_entity(hass, "sensor", entry, "1_estimated_energy")
-        assert float(hass.states.get(energy).state) == 12.5
+        shown: list[float] = []
+
+        def look(event: Event[EventStateChangedData]) -> None:
+            state = event.data["new_state"]
+            if state is None or state.state in {"unavailable", "unknown"}:
+                return
+            shown.append(float(state.state))
+            (record,) = hass_storage[TOTALS_KEY]["data"].values()
+            assert shown[-1] * 1000 <= record["total"] + 0.001
+
+        hass.bus.async_listen("state_changed", look, only(energy))
         car.plug_in()
-        await wait_for_state(hass, energy, lambda state: float(state.state) > 12.5)
+        await wait_for_state(hass, energy, lambda state: is_above(state, 0.0001))
+        await crash(hass, entry, hass_storage)
+        before = shown[-1]
+        await hass.config_entries.async_setup(entry.entry_id)
+        await wait_for_state(hass, energy, lambda state: is_above(state, before))
+    assert shown == sorted(shown)
 
 
-async def test_a_meter_exchanged_during_a_restart_is_no_consumption(
+def only(entity_id: str) -> Callable[[EventStateChangedData], bool]:
+    """Return a filter for the events of one entity."""
+
+    @callback
+    def is_of(data: EventStateChangedData) -> bool:
+        return data["entity_id"] == entity_id
+
+    return is_of
+
+
+def is_above(state: State, value: float) -> bool:
+    return state.state not in {"unavailable", "unknown"} and float(state.state) > value
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait for no correction of the wall clock."""
+    monkeypatch.setattr(energy_module, "PATIENCE", 0.0)
+
+
+@pytest.mark.parametrize(
+    ("grown", "shown", "count"), [(1000, 11.0, 0), (90_000, 10.0, 1), (-1, 10.0, 1)]
+)
+@pytest.mark.usefixtures("impatient")
+async def test_a_meter_after_a_restart(
     hass: HomeAssistant,
+    hass_storage: dict[str, Any],
+    grown: int,
+    shown: float,
+    count: int,
 ) -> None:
-    mock_restore_cache_with_extra_data(
-        hass,
-        [
-            (
-                State(
-                    "sensor.charger_1923054_energy",
-                    "10.0",
-                    last_updated=dt_util.utcnow() - timedelta(minutes=5),
-                ),
-                {
-                    "native_value": 10000.0,
-                    "native_unit_of_measurement": "Wh",
-                    "offset": 4000.0,
-                },
-            )
-        ],
-    )
-    box = EvboxChargePoint(1923054, [Module(energy_wh=750_000)], min_interval=0)
+    """In 5 minutes, one kWh may have flowed; what may not is reported."""
+    box = EvboxChargePoint(1923054, [Module(energy_wh=6000)], min_interval=0)
     async with running(hass, box, poll_interval=0.2) as (entry, _):
         energy = await get_entity(hass, "sensor", entry, "1_energy")
-        state = await wait_for_state(hass, energy, lambda _: True)
-        assert float(state.state) == 10.0
+        await wait_for_state(hass, energy, "6.0")
+        await shut_down(hass, entry)
+        (record,) = hass_storage[TOTALS_KEY]["data"].values()
+        assert record["total"] == record["meter"] == 6000
+        record["total"] = 10_000.0
+        record["wall"] -= 300
+        box.modules[0].energy_wh += grown
+        await hass.config_entries.async_setup(entry.entry_id)
+        await wait_for_state(hass, energy, str(shown))
+        issues = [
+            issue
+            for (domain, _), issue in ir.async_get(hass).issues.items()
+            if domain == DOMAIN and issue.translation_key == "energy_not_counted"
+        ]
+        assert len(issues) == count
 
 
-async def test_the_same_meter_after_a_restart(hass: HomeAssistant) -> None:
-    mock_restore_cache_with_extra_data(
-        hass,
-        [
-            (
-                State("sensor.charger_1923054_energy", "10.0"),
-                {
-                    "native_value": 10000.0,
-                    "native_unit_of_measurement": "Wh",
-                    "offset": 4000.0,
-                },
-            )
-        ],
-    )
-    box = EvboxChargePoint(1923054, [Module(energy_wh=6001)], min_interval=0)
-    async with running(hass, box, poll_interval=0.2) as (entry, _):
-        energy = await get_entity(hass, "sensor", entry, "1_energy")
-        state = await wait_for_state(hass, energy, lambda _: True)
-        assert float(state.state) == 10.001
+@pytest.mark.parametrize(
+    "damage", [{"total": None}, {"meter": float("nan")}, {"wall": True}, [], None]
+)
+async def test_a_damaged_record_is_left_out(
+    hass: HomeAssistant, hass_storage: dict[str, Any], damage: object
+) -> None:
+    good = {"total": 1.0, "meter": 2, "wall": 3.0}
+    bad = good | damage if isinstance(damage, dict) else damage
+    hass_storage[TOTALS_KEY] = {
+        "version": 1,
+        "minor_version": 1,
+        "key": TOTALS_KEY,
+        "data": {"good": good, "bad": bad},
+    }
+    store = TotalStore(hass)
+    await store.async_load()
+    assert store.get("good") == MeterRecord(1.0, 2, 3.0)
+    assert store.get("bad") is None
+
+
+async def test_totals_are_written_in_steps_and_at_stop(
+    hass: HomeAssistant, hass_storage: dict[str, Any]
+) -> None:
+    store = TotalStore(hass)
+    await store.async_load()
+
+    async def put(total: float, seconds: float) -> float:
+        store.put("a", MeterRecord(total, total, 0.0))
+        async_fire_time_changed(
+            hass, dt_util.utcnow() + timedelta(seconds=seconds), fire_all=True
+        )
+        await hass.async_block_till_done(wait_background_tasks=True)
+        return float(hass_storage[TOTALS_KEY]["data"]["a"]["total"])
+
+    assert await put(0.0, 1) == 0.0
+    assert await put(STEP - 1, INTERVAL + 1) == 0.0
+    assert await put(STEP, INTERVAL + 1) == STEP
+    assert await put(STEP + 1, INTERVAL + 1) == STEP
+    hass.bus.async_fire(EVENT_HOMEASSISTANT_FINAL_WRITE)
+    await hass.async_block_till_done()
+    assert hass_storage[TOTALS_KEY]["data"]["a"]["total"] == STEP + 1
+
+
+async def test_what_the_disk_refuses_is_not_stored(
+    hass: HomeAssistant, hass_storage: dict[str, Any]
+) -> None:
+    store = TotalStore(hass)
+    await store.async_load()
+    store.put("a", MeterRecord(5.0, 5.0, 0.0))
+    with patch.object(StoredFile, "async_write", return_value=OSError("full")):
+        await store.async_flush()
+    assert store.stored("a") is None
+    await store.async_flush()
+    assert store.stored("a") == store.get("a")
+    assert hass_storage[TOTALS_KEY]["data"]["a"]["total"] == 5.0
+    store._stop_timer()

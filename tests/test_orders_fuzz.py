@@ -389,7 +389,7 @@ def test_a_restart_never_allows_more_than_the_user(
         hass = HomeAssistant("")
         await live(House(hass, has_serial=has_serial), state, sequence)
 
-    with patch.object(module, "_File", DiskFile):
+    with patch.object(module, "StoredFile", DiskFile):
         asyncio.run(run())
 
 

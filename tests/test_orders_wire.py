@@ -219,7 +219,7 @@ CRASH: tuple[str, dict[str, Any]] = ("crash", {})
 def test_no_frame_ever_has_more_than_the_user_ordered(
     state: str, sequence: list[tuple[str, dict[str, Any]]]
 ) -> None:
-    with patch.object(module, "_File", DiskFile):
+    with patch.object(module, "StoredFile", DiskFile):
         simulate(live(state, sequence))
 
 
@@ -240,5 +240,5 @@ def test_a_refused_lowering_is_written_by_itself(pause: float) -> None:
         assert '"current": 9.0' in house.disk.files[ORDERS_KEY]
         await house.crash()
 
-    with patch.object(module, "_File", DiskFile):
+    with patch.object(module, "StoredFile", DiskFile):
         simulate(scene())

@@ -28,6 +28,7 @@ from custom_components.evse_bus.evse.protocol import Protocol
 from custom_components.evse_bus.evse.protocols import PROTOCOLS
 from custom_components.evse_bus.issues import (
     DUPLICATE_ADDRESS,
+    ENERGY_NOT_COUNTED,
     LOST,
     NO_SUCH_PORT,
     NOT_STORED,
@@ -125,6 +126,7 @@ def test_errors_have_texts() -> None:
 def test_issues_have_texts() -> None:
     assert english()["issues"].keys() == {
         DUPLICATE_ADDRESS,
+        ENERGY_NOT_COUNTED,
         LOST,
         NO_SUCH_PORT,
         NOT_STORED,

@@ -26,6 +26,7 @@ from .discovery import (
     async_listener_gone,
     async_offer_when_started,
 )
+from .energy import TOTALS, TotalStore
 from .errors import not_ready
 from .evse.errors import LineError
 from .issues import report_orders_written
@@ -49,8 +50,9 @@ async def async_setup(
     hass: HomeAssistant,
     config: ConfigType,  # noqa: ARG001 - there is no YAML
 ) -> bool:
-    """Register the actions and the store of orders, which all config entries share."""
+    """Register the actions and the stores, which all config entries share."""
     hass.data[ORDERS] = OrderStore(hass, partial(report_orders_written, hass))
+    hass.data[TOTALS] = TotalStore(hass)
     async_register(hass)
     return True
 
@@ -108,6 +110,7 @@ async def async_remove_entry(hass: HomeAssistant, entry: EvseBusConfigEntry) -> 
     keys = [bus_key(entry.entry_id)]
     for subentry_id in entry.subentries:
         keys += subentry_keys(subentry_id, protocol_of(entry.data).ports)
+        await hass.data[TOTALS].async_forget(subentry_id)
     await orders.async_forget(keys)
 
 

@@ -30,6 +30,7 @@ from .connections import make_connections
 from .const import CONF_SERIAL, DOMAIN, LOGGER, SUBENTRY_CHARGER
 from .devices import BusDevices
 from .discovery import async_set_up_now, async_wants_to_connect
+from .energy import TOTALS
 from .evse.bus import Bus
 from .evse.listeners import notify
 from .evse.model import ChargerConfig, Circuit, Orders
@@ -305,6 +306,8 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         await self.orders.async_forget(
             charger_keys(self.protocol, managed.subentry_id, managed.charger.config)
         )
+        if managed.subentry_id not in self.config_entry.subentries:
+            await self.hass.data[TOTALS].async_forget(managed.subentry_id)
         self._notify(BUS)
 
     def _put_on_bus(self, managed: ManagedCharger) -> None:

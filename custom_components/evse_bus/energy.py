@@ -1,54 +1,151 @@
-"""Energy totals that grow only by measured consumption. Pure.
+"""Energy totals that grow only by measured consumption, and their storage.
 
 The recorder counts every rise of a total as consumption. The value of a meter may
 jump for other reasons: a box was exchanged, or another module took its address. Then
-the total continues from its old value, with the new meter.
+the total continues from its old value, with the new meter. What has flowed while
+nothing was read counts as far as it can have flowed in that time.
+
+Restored entity states may be minutes old after a crash. The recorder would take a total
+that falls for a meter that was reset, and count its energy again. So totals have a file
+of their own, written once `STEP` is new, at most once in `INTERVAL`, and at stop.
 """
 
-from dataclasses import dataclass, field
-from typing import Final
+import asyncio
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from math import isfinite
+from typing import Any, Final
 
-HIGHEST_POWER: Final = 3 * 80.0 * 250.0
-"""Upper bound for any connector, W: three phases, 80 A (IEC 61851-1), 250 V."""
+from homeassistant.const import EVENT_HOMEASSISTANT_FINAL_WRITE
+from homeassistant.core import CALLBACK_TYPE, Event, HassJob, HomeAssistant, callback
+from homeassistant.helpers.event import async_call_later
+from homeassistant.util.hass_dict import HassKey
+
+from .const import DOMAIN, LOGGER
+from .evse.listeners import Observable
+from .evse.meter import HIGHEST_CURRENT, most_energy
+from .storage import UNREADABLE, StoredFile
+
+TOTALS_KEY: Final = f"{DOMAIN}.totals"
+"""File name in the storage folder of Home Assistant."""
+STEP: Final = 100.0
+"""Energy that is written as soon as it is new, Wh."""
+INTERVAL: Final = 60.0
+"""Shortest time between two writes, s."""
+
+PATIENCE: Final = 900.0
+"""Time in which the clock of a computer that has just started may be corrected, s."""
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
+class MeterRecord:
+    """The total of a meter as it is stored."""
+
+    total: float
+    """Wh"""
+    meter: float
+    """Value of the meter that belongs to it, Wh."""
+    wall: float
+    """Wall-clock time of that value, s since 1970."""
+    monotonic: float | None = None
+    """Monotonic time of it, s; ``None``: of an earlier run, or not comparable."""
+
+
+@dataclass(frozen=True, slots=True)
+class Clocks:
+    """The time by both clocks."""
+
+    monotonic: float
+    """s"""
+    wall: float
+    """s since 1970; may be wrong, and be corrected, after the computer has started."""
+
+    def since(self, record: MeterRecord) -> float:
+        """Return the time since a record, s; by the wall clock after a restart."""
+        if record.monotonic is not None:
+            return self.monotonic - record.monotonic
+        return self.wall - record.wall
+
+
 class MeterTotal:
     """The total of a charger's own meter."""
 
-    offset: float = 0.0
-    """Added to the value of the meter, Wh."""
-    total: float | None = None
-    """Wh; equal to the value of the first meter as long as that stays."""
-    generation: int | None = None
-    """Generation of the last meter; ``None``: none read since the start."""
-    _offsets: dict[int, float] = field(default_factory=dict)
-    """Offsets of former generations, which the meter may resume, Wh."""
+    def __init__(self, stored: MeterRecord | None = None) -> None:
+        """Continue a stored total."""
+        self.total = stored.total if stored is not None else None
+        """Wh; equal to the value of the first meter as long as that stays."""
+        self.not_counted: float | None = None
+        """Change of the meter in an absence that is more than can have flowed, Wh."""
+        self._stored = stored
+        self._meter = 0.0
+        self._generation: int | None = None
+        self._offsets: dict[int, float] = {}
+        """Offset of the total to each generation of the meter, Wh."""
+        self._gap: float | None = None
+        """Change of the meter in an absence, not counted yet, Wh."""
+        self._began = 0.0
 
-    def update(self, meter: float, generation: int, downtime: float = 0.0) -> float:
+    def update(
+        self,
+        meter: float,
+        generation: int,
+        clocks: Clocks,
+        current: float = HIGHEST_CURRENT,
+    ) -> float:
         """Return the total for a value of the meter, both in Wh.
 
-        ``downtime``: time since the total was stored before a restart, s.
+        ``current``: the highest phase current behind the meter, A.
         """
-        if self.generation is None:
-            # After a restart the generation is unknown: judge by the possible energy.
-            is_known = self.total is None or (
-                0
-                <= self.offset + meter - self.total
-                <= HIGHEST_POWER * downtime / 3600 + 1
-            )
-        else:
-            self._offsets[self.generation] = self.offset
-            is_known = generation in self._offsets
-            self.offset = self._offsets.get(generation, 0.0)
-        if self.total is not None and (
-            not is_known or self.offset + meter < self.total
-        ):
-            # What it has counted before is no consumption.
-            self.offset = self.total - meter
-        self.generation = generation
-        self.total = max(self.offset + meter, self.total or 0.0)
+        total = self.total
+        if self._generation is None and self._stored is not None:
+            self._gap = meter - self._stored.meter
+            self._began = clocks.monotonic
+        offset = self._offsets.get(generation)
+        if offset is None:
+            # Another meter: what it has counted before is no consumption.
+            offset = 0.0 if total is None else total - meter
+        if total is not None and offset + meter < total:
+            offset = total - meter
+        self._offsets[generation] = offset
+        self._generation = generation
+        self._meter = meter
+        self.total = offset + meter if total is None else max(offset + meter, total)
+        self._judge_gap(clocks, current)
         return self.total
+
+    def _judge_gap(self, clocks: Clocks, current: float) -> None:
+        """Count the energy of an absence, or drop it, as soon as this can be decided.
+
+        The computer may have started with a wrong time: energy that is too much for
+        the absence by the wall clock waits for `PATIENCE`.
+        """
+        gap, stored = self._gap, self._stored
+        if gap is None or stored is None or self.total is None:
+            return
+        running = clocks.monotonic - self._began
+        away = clocks.since(stored) - running
+        if 0 <= gap <= most_energy(away, current):
+            self.total += gap
+            self._offsets = {one: by + gap for one, by in self._offsets.items()}
+        elif gap >= 0 and running < PATIENCE:
+            return
+        else:
+            self.not_counted = gap
+        self._gap = None
+
+    def record(self, clocks: Clocks) -> MeterRecord | None:
+        """Return the total to store; ``None``: there is none.
+
+        As long as the energy of an absence waits, the next run can decide about it.
+        """
+        if self.total is None or self._generation is None:
+            return self._stored
+        if self._gap is not None and self._stored is not None:
+            stored = self._stored
+            meter = self._meter - self._gap
+            return MeterRecord(self.total, meter, stored.wall, stored.monotonic)
+        return MeterRecord(self.total, self._meter, clocks.wall, clocks.monotonic)
 
 
 @dataclass(slots=True)
@@ -70,3 +167,152 @@ class SummedTotal:
         self.total += summed - self.counted
         self.counted = summed
         return self.total
+
+
+# -- The store -------------------------------------------------------------------
+
+
+class TotalStore(Observable):
+    """The stored totals, by the unique id of their entity.
+
+    Listeners are called after each successful write.
+    """
+
+    def __init__(self, hass: HomeAssistant) -> None:
+        """Read nothing yet."""
+        super().__init__()
+        self._hass = hass
+        self._file = StoredFile(hass, TOTALS_KEY)
+        self._records: dict[str, MeterRecord] = {}
+        self._on_disk: dict[str, MeterRecord] = {}
+        self._loaded = False
+        self._failed = False
+        self._written_at: float | None = None
+        self._cancel_timer: CALLBACK_TYPE | None = None
+        self._busy = asyncio.Lock()
+        hass.bus.async_listen_once(
+            EVENT_HOMEASSISTANT_FINAL_WRITE, self._async_final_write
+        )
+
+    async def async_load(self) -> None:
+        """Read the file, once; an unreadable one is treated as missing."""
+        async with self._busy:
+            if self._loaded:
+                return
+            stored: dict[str, Any] = {}
+            try:
+                stored = dict(await self._file.async_load() or {})
+            except UNREADABLE as error:
+                LOGGER.error("The stored energy totals cannot be read: %s", error)
+            for key, record in stored.items():
+                try:
+                    self._records[key] = decode(record)
+                except UNREADABLE as error:
+                    LOGGER.error("A stored energy total cannot be used: %s", error)
+            self._on_disk = dict(self._records)
+            self._loaded = True
+
+    def get(self, key: str) -> MeterRecord | None:
+        """Return the newest record of a total; ``None``: there is none."""
+        return self._records.get(key)
+
+    def stored(self, key: str) -> MeterRecord | None:
+        """Return the record on disk; ``None``: there is none."""
+        return self._on_disk.get(key)
+
+    @callback
+    def put(self, key: str, record: MeterRecord) -> None:
+        """Take a record, and write it soon if `STEP` or another meter is new."""
+        self._records[key] = record
+        stored = self._on_disk.get(key)
+        if stored is None or (
+            record.total - stored.total >= STEP
+            or abs(_offset(record) - _offset(stored)) >= 1
+        ):
+            self._write_soon()
+
+    async def async_forget(self, prefix: str) -> None:
+        """Delete the totals whose keys begin with this."""
+        keys = [key for key in self._records if key.startswith(prefix)]
+        for key in keys:
+            del self._records[key]
+        if keys:
+            await self.async_flush()
+
+    # -- Writing -----------------------------------------------------------------
+
+    async def async_flush(self) -> None:
+        """Write all records now, if any has changed."""
+        async with self._busy:
+            self._stop_timer()
+            records = dict(self._records)
+            if records == self._on_disk:
+                return
+            self._written_at = self._hass.loop.time()
+            error = await self._file.async_write(
+                {key: encode(record) for key, record in records.items()}
+            )
+            if error is not None:
+                if not self._failed:
+                    LOGGER.error("Energy totals cannot be stored: %s", error)
+                self._failed = True
+                self._write_soon()
+                return
+            self._failed = False
+            self._on_disk = records
+        self.updated()
+
+    def _write_soon(self) -> None:
+        if self._cancel_timer is not None:
+            return
+        pause = 0.0
+        if self._written_at is not None:
+            pause = self._written_at + INTERVAL - self._hass.loop.time()
+        self._cancel_timer = async_call_later(
+            self._hass,
+            max(pause, 0.0),
+            HassJob(self._async_on_timer, cancel_on_shutdown=True),
+        )
+
+    async def _async_on_timer(self, _now: datetime) -> None:
+        self._cancel_timer = None
+        await self.async_flush()
+
+    @callback
+    def _stop_timer(self) -> None:
+        if self._cancel_timer is not None:
+            self._cancel_timer()
+            self._cancel_timer = None
+
+    async def _async_final_write(self, _event: Event) -> None:
+        await self.async_flush()
+        self._stop_timer()
+
+
+TOTALS: Final[HassKey[TotalStore]] = HassKey(TOTALS_KEY)
+
+
+def _offset(record: MeterRecord) -> float:
+    return record.total - record.meter
+
+
+def encode(record: MeterRecord) -> dict[str, float]:
+    """Return the stored form of a record; a monotonic time ends with its run."""
+    return {"total": record.total, "meter": record.meter, "wall": record.wall}
+
+
+def decode(stored: Mapping[str, Any]) -> MeterRecord:
+    """Return a record from its stored form.
+
+    Raises TypeError, KeyError or ValueError for a record of another shape.
+    """
+    values = [stored[name] for name in ("total", "meter", "wall")]
+    for value in values:
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            message = f"{value!r} is no number"
+            raise TypeError(message)
+        if not isfinite(value):
+            message = f"{value!r} is not finite"
+            raise ValueError(message)
+    total, meter, wall = values
+    return MeterRecord(total, meter, wall)

@@ -16,6 +16,7 @@ NOT_STORED: Final = "orders_not_stored"
 LOST: Final = "orders_lost"
 SUPPLY_LOST: Final = "supply_lost"
 TIMEOUT_RAISED: Final = "timeout_raised"
+ENERGY_NOT_COUNTED: Final = "energy_not_counted"
 SECOND_MASTER: Final = "second_master"
 
 WRONG_CHARGER: Final = "wrong_charger"
@@ -72,6 +73,20 @@ class BusIssues:
     def orders_renewed(self, managed: ManagedCharger) -> None:
         """Clear the report of missing orders: the user has given new ones."""
         self._set(LOST, managed.key, present=False)
+
+    def energy_not_counted(
+        self, managed: ManagedCharger, number: int, energy: float
+    ) -> None:
+        """Report a meter that has changed more in an absence than can have flowed.
+
+        ``energy``: by how much, Wh; negative: it has fallen.
+        """
+        self._set(
+            ENERGY_NOT_COUNTED,
+            f"{number}_{managed.key}",
+            present=True,
+            placeholders={"charger": managed.name, "energy": f"{energy / 1000:+.1f}"},
+        )
 
     def supply_lost(self, current: float) -> None:
         """Report that the stored limit of the shared supply is missing."""

@@ -31,12 +31,8 @@ from homeassistant.core import (
     HomeAssistant,
     callback,
 )
-from homeassistant.exceptions import HomeAssistantError
 from homeassistant.helpers.event import async_call_later
-from homeassistant.helpers.storage import Store
-from homeassistant.util.file import WriteError
 from homeassistant.util.hass_dict import HassKey
-from homeassistant.util.json import SerializationError
 
 from .const import DOMAIN, LOGGER
 from .evse.errors import RefusedOrderError
@@ -44,8 +40,8 @@ from .evse.listeners import Observable
 from .evse.model import ChargerConfig, CurrentLimit, Orders, Phases
 from .evse.protocol import Protocol
 from .evse.safety import cautious, number
+from .storage import UNREADABLE, StoredFile
 
-STORAGE_VERSION: Final = 1
 ORDERS_KEY: Final = f"{DOMAIN}.orders"
 KNOWN_KEY: Final = f"{DOMAIN}.known_chargers"
 """File names in the storage folder of Home Assistant."""
@@ -61,16 +57,6 @@ _SERIAL: Final = "serial:"
 _SUBENTRY: Final = "subentry:"
 _BUS: Final = "bus:"
 """Prefixes of the keys of records, by what they belong to."""
-
-_UNREADABLE = (
-    HomeAssistantError,  # also a version from the future
-    NotImplementedError,  # no migration from that version
-    OSError,
-    AttributeError,
-    KeyError,
-    TypeError,
-    ValueError,
-)
 
 
 async def async_run_uncancelled[T](
@@ -184,8 +170,8 @@ class OrderStore(Observable):
         """Read nothing yet; ``on_write`` is called after each write, with its error."""
         super().__init__()
         self._hass = hass
-        self._orders_file = _File(hass, ORDERS_KEY)
-        self._known_file = _File(hass, KNOWN_KEY)
+        self._orders_file = StoredFile(hass, ORDERS_KEY)
+        self._known_file = StoredFile(hass, KNOWN_KEY)
         self._on_write = on_write
         self._failed = False
         self._loaded = False
@@ -218,16 +204,16 @@ class OrderStore(Observable):
             for key, record in stored.items():
                 try:
                     self._records[key] = decode(record)
-                except (RefusedOrderError, *_UNREADABLE) as error:
+                except (RefusedOrderError, *UNREADABLE) as error:
                     LOGGER.error("A stored order cannot be used: %s", error)
             self._known |= self._records.keys()
             self._on_disk = {key: [one.order] for key, one in self._records.items()}
             self._loaded = True
 
-    async def _async_read(self, file: _File) -> dict[str, Any]:
+    async def _async_read(self, file: StoredFile) -> dict[str, Any]:
         try:
             return dict(await file.async_load() or {})
-        except _UNREADABLE as error:
+        except UNREADABLE as error:
             LOGGER.error("The stored orders cannot be read: %s", error)
             return {}
 
@@ -480,32 +466,6 @@ class OrderStore(Observable):
 
 
 ORDERS: Final[HassKey[OrderStore]] = HassKey(ORDERS_KEY)
-
-
-class _File(Store[dict[str, Any]]):
-    """A file in the storage folder whose writes have ended when they return."""
-
-    def __init__(self, hass: HomeAssistant, key: str) -> None:
-        super().__init__(hass, STORAGE_VERSION, key, atomic_writes=True)
-
-    async def async_write(self, data: dict[str, Any]) -> Exception | None:
-        """Write now, also while Home Assistant stops; return the error, if any.
-
-        `Store.async_save` would only plan a write while Home Assistant stops, and
-        would not tell whether it succeeds.
-        """
-        self._manager.async_invalidate(self.key)
-        content = {
-            "version": self.version,
-            "minor_version": self.minor_version,
-            "key": self.key,
-            "data": data,
-        }
-        try:
-            await self._async_write_data(content)
-        except (WriteError, SerializationError, OSError) as error:
-            return error
-        return None
 
 
 # -- The stored form -------------------------------------------------------------

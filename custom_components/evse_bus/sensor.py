@@ -1,17 +1,13 @@
 """Sensors: readings of the chargers, and statistics of the bus."""
 
 from collections.abc import Callable, Hashable, Iterable
-from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
-from math import isfinite
-from typing import Any, TypeGuard, override
+from typing import Any, override
 
 from homeassistant.components.sensor import (
-    RestoreSensor,
     SensorEntity,
     SensorEntityDescription,
-    SensorExtraStoredData,
 )
 from homeassistant.const import Platform
 from homeassistant.core import HomeAssistant
@@ -26,7 +22,7 @@ from .coordinator import (
     Context,
     EvseBusConfigEntry,
 )
-from .energy import MeterTotal, SummedTotal
+from .energy import TOTALS, Clocks, MeterRecord, MeterTotal, SummedTotal
 from .entity import (
     BusEntity,
     ChargerEntity,
@@ -35,6 +31,7 @@ from .entity import (
     add_charger_entities,
     supported,
 )
+from .evse.meter import HIGHEST_CURRENT
 from .evse.model import Capability, Fault
 from .managed_charger import ManagedCharger
 from .sensor_tables import (
@@ -261,23 +258,27 @@ class ConnectorSensor(ConnectorEntity, _ValueSensor):
         return None if reading is None else self._value(reading)
 
 
-class EnergySensor(ConnectorEntity, RestoreSensor):
+class EnergySensor(ConnectorEntity, SensorEntity):
     """The total of the meter; a jump to the value of another meter is left out."""
 
     @override
     async def async_added_to_hass(self) -> None:
-        """Restore the total of the last run."""
-        self._total = MeterTotal()
-        self._stored_at = dt_util.utcnow()
-        data = await self.async_get_last_sensor_data()
-        extra = await self.async_get_last_extra_data()
-        state = await self.async_get_last_state()
-        if data is not None and extra is not None and state is not None:
-            offset = extra.as_dict().get("offset")
-            if is_energy(data.native_value) and is_energy(offset):
-                self._total = MeterTotal(offset=offset, total=data.native_value)
-                self._stored_at = state.last_updated
+        """Continue the stored total."""
+        self._store = self.hass.data[TOTALS]
+        await self._store.async_load()
+        self._source = self.charger
+        self._total = MeterTotal(self._store.get(self._key))
         await super().async_added_to_hass()
+
+    @override
+    async def async_will_remove_from_hass(self) -> None:
+        """Store the total."""
+        await super().async_will_remove_from_hass()
+        await self._store.async_flush()
+
+    @property
+    def _key(self) -> str:
+        return self.unique_id or ""
 
     @override
     def update_attributes(self) -> Hashable:
@@ -285,57 +286,75 @@ class EnergySensor(ConnectorEntity, RestoreSensor):
         reading = self.reading
         shown = None
         if reading is not None and reading.energy is not None:
-            downtime = (dt_util.utcnow() - self._stored_at).total_seconds()
-            shown = self._total.update(
-                reading.energy, reading.meter_generation, downtime
-            )
+            shown = self._update_total(reading.energy, reading.meter_generation)
         self._attr_native_value = shown
         return shown
 
-    @property
-    @override
-    def extra_restore_state_data(self) -> MeterData:
-        """Return the data to store for the next run."""
-        return MeterData(
-            self._total.total, self.native_unit_of_measurement, self._total.offset
-        )
+    def _update_total(self, energy: float, generation: int) -> float:
+        clocks = _clocks(self.hass)
+        if self._source is not self.charger:
+            # Its meters, and their generations, begin anew.
+            self._source = self.charger
+            self._total = MeterTotal(self._total.record(clocks))
+        charger = self.charger.reading
+        maximum = charger.maximum_current if charger is not None else None
+        current = min(maximum or HIGHEST_CURRENT, HIGHEST_CURRENT)
+        total = self._total.update(energy, generation, clocks, current)
+        if (record := self._total.record(clocks)) is not None:
+            self._store.put(self._key, record)
+        if self._total.not_counted is not None:
+            self.coordinator.issues.energy_not_counted(
+                self.managed, self.number, self._total.not_counted
+            )
+            self._total.not_counted = None
+        return total
 
 
-@dataclass
-class MeterData(SensorExtraStoredData):
-    """Stored data of a meter's total."""
+class EstimatedEnergySensor(ConnectorEntity, SensorEntity):
+    """Estimated energy: the sum of the library, continued across restarts.
 
-    offset: float
-
-    @override
-    def as_dict(self) -> dict[str, Any]:
-        """Return the data as it is stored."""
-        return {**super().as_dict(), "offset": self.offset}
-
-
-class EstimatedEnergySensor(ConnectorEntity, RestoreSensor):
-    """Estimated energy: the sum of the library, continued across restarts."""
+    No meter keeps it, so only what is stored is shown: a total that falls after a
+    crash would be taken for a new one.
+    """
 
     @override
     async def async_added_to_hass(self) -> None:
-        """Restore the total of the last run."""
-        self._total = SummedTotal()
-        last = await self.async_get_last_sensor_data()
-        if last is not None and is_energy(last.native_value):
-            self._total = SummedTotal(total=last.native_value)
+        """Continue the stored total."""
+        self._store = self.hass.data[TOTALS]
+        await self._store.async_load()
+        stored = self._store.get(self._key)
+        self._total = SummedTotal(total=stored.total if stored is not None else 0.0)
+        self.async_on_remove(self._store.subscribe(self._handle_coordinator_update))
         await super().async_added_to_hass()
 
     @override
+    async def async_will_remove_from_hass(self) -> None:
+        """Store the total."""
+        await super().async_will_remove_from_hass()
+        await self._store.async_flush()
+
+    @property
+    def _key(self) -> str:
+        return self.unique_id or ""
+
+    @override
     def update_attributes(self) -> Hashable:
-        """Add the energy since the last update."""
+        """Add the energy since the last update; show what is stored."""
         reading = self.reading
         summed = reading.estimated_energy if reading is not None else None
         if summed is not None:
-            self._total.update(summed, self.charger)
-        self._attr_native_value = shown = round(self._total.total, 3)
+            total = self._total.update(summed, self.charger)
+            clocks = _clocks(self.hass)
+            record = MeterRecord(total, total, clocks.wall, clocks.monotonic)
+            known = self._store.get(self._key)
+            if known is None or known.total != total:
+                self._store.put(self._key, record)
+        stored = self._store.stored(self._key)
+        self._attr_native_value = shown = (
+            None if stored is None else round(stored.total, 3)
+        )
         return shown
 
 
-def is_energy(value: object) -> TypeGuard[float]:
-    """Return whether a stored value is a usable energy."""
-    return isinstance(value, (int, float)) and isfinite(value)
+def _clocks(hass: HomeAssistant) -> Clocks:
+    return Clocks(hass.loop.time(), dt_util.utcnow().timestamp())
