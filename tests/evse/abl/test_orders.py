@@ -25,7 +25,7 @@ from custom_components.evse_bus.evse.model import (
 from tests.simulated_time import simulate
 from tests.virtual import AblBox, Car, Request
 
-from .scene import LIMIT, Scene, config, orders, until
+from .scene import LIMIT, SERIAL, Scene, config, orders, until
 
 PAUSE = 1000
 ON = OrderChange(allowed=True)
@@ -214,6 +214,33 @@ async def test_a_box_that_does_not_follow() -> None:
         await until(lambda: box.ic_amps < 10)
         await until(lambda: Fault.LIMIT_NOT_TAKEN not in charger.faults)
         assert charger.available
+
+
+async def test_a_lowered_limit_is_not_overtaken_by_the_write_under_way() -> None:
+    box = AblBox(1, car=plugged())
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders(10))
+        await scene.stop_polls(charger)
+        box.outlet.ignore_limit = True
+        raising = asyncio.create_task(charger.change_orders(limit(16)))
+        await until(lambda: 266 in scene.writes(LIMIT))
+        written = len(scene.writes(LIMIT))
+        # A reply is missed: the box is identified before the next write.
+        charger.on_missed(charger.slot.ready)
+        answer = box._answer
+        lowering: list[asyncio.Task[None]] = []
+
+        def lower(request: Request) -> bytes | None:
+            if request.register == SERIAL and not lowering:
+                lowering.append(asyncio.create_task(charger.change_orders(limit(6))))
+            return answer(request)
+
+        box._answer = lower  # type: ignore[method-assign]
+        await until(lambda: lowering)
+        box.outlet.ignore_limit = False
+        await asyncio.gather(raising, *lowering, return_exceptions=True)
+        assert charger.orders.limit.current == 6
+        assert set(scene.writes(LIMIT)[written:]) == {100}
 
 
 async def test_a_box_that_does_not_follow_the_permission() -> None:

@@ -502,7 +502,7 @@ class AblReader(Charger[AblConfig]):
     ) -> Reading:
         """Write a set-point until the register that means it shows it.
 
-        ``setpoint`` is called for each write: the orders may change between turns.
+        ``setpoint`` is called right before each write: the orders may change.
         ``starts``: a pause that is read back does not count as below. Waits for
         ``patience`` seconds at most. Returns the status that confirms it.
 
@@ -514,14 +514,13 @@ class AblReader(Charger[AblConfig]):
         refused: ExchangeRefusedError | None = None
         has_rested = False
         while True:
-            wanted = setpoint()
-            code = limit_duty(wanted)
             over = turn.now >= until
+            due = self.writes.due(limit_duty(setpoint()))
             try:
-                if turn.now >= self.writes.due(code) and not over:
+                if turn.now >= due and not over:
                     # A reply may have been missed since the last turn.
                     await self.identify(turn)
-                    await self._write_limit(turn, wanted)
+                    await self._write_limit(turn, setpoint)
                 status = await self.read_status(turn)
             except ExchangeRefusedError as error:
                 # It may have been taken all the same: read first, then repeat.
@@ -533,6 +532,7 @@ class AblReader(Charger[AblConfig]):
                     raise
                 await rest(next(pauses))
                 continue
+            code = limit_duty(setpoint())
             if self._is_taken(status, turn.now, code, starts=starts, finally_=over):
                 if code != PAUSE:
                     self.confirmed = code
@@ -548,18 +548,21 @@ class AblReader(Charger[AblConfig]):
         message = f"{self.config.name} does not follow its limit"
         raise NotConfirmedError(message)
 
-    async def _write_limit(self, turn: Turn, setpoint: Setpoint) -> None:
-        code = limit_duty(setpoint)
-        if self.writes.is_repeat(code, turn.now):
-            self.statistics.reasserted += 1
-        self.writes.wrote(code, turn.now)
-        self.raise_pending = False
-        # Only what is read after the write counts.
-        self._icmax = None
+    async def _write_limit(self, turn: Turn, setpoint: Callable[[], Setpoint]) -> None:
+        def request() -> bytes:
+            wanted = setpoint()
+            code = limit_duty(wanted)
+            if self.writes.is_repeat(code, turn.now):
+                self.statistics.reasserted += 1
+            self.writes.wrote(code, turn.now)
+            self.raise_pending = False
+            # Only what is read after the write counts.
+            self._icmax = None
+            return write_limit(self.config.address, wanted)
+
         try:
             await turn.exchange(
-                write_limit(self.config.address, setpoint),
-                write_answer(self.config.address, LIMIT_REGISTER),
+                request, write_answer(self.config.address, LIMIT_REGISTER)
             )
         except ReplyTimeoutError:
             self.writes.unanswered()
