@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 ENGLISH = Path(__file__).parents[1] / f"custom_components/{DOMAIN}/translations/en.json"
 PATIENCE = 50
+BROWSER = 1.0
+"""Time until a browser that shows a search has subscribed to its end, s."""
 NOWHERE = "/dev/serial/by-id/usb-there-is-no-such-adapter"
 IMPOSED = {
     "installation_limit": 20,
@@ -150,7 +152,10 @@ class Flow:
         return self
 
     async def wait(self) -> Flow:
-        """Wait for the end of a search, as the frontend does: for its event."""
+        """Wait for the end of a search, as the frontend does: for its event.
+
+        It subscribes once it shows the progress; an earlier event is lost.
+        """
         assert self.result["type"] is FlowResultType.SHOW_PROGRESS
         done = asyncio.Event()
 
@@ -164,11 +169,11 @@ class Flow:
             if event.data["flow_id"] == self.flow_id:
                 self.progress.append(event.data["progress"])
 
-        stop = [
-            self.hass.bus.async_listen(EVENT_DATA_ENTRY_FLOW_PROGRESSED, progressed),
-            self.hass.bus.async_listen(EVENT_DATA_ENTRY_FLOW_PROGRESS_UPDATE, progress),
-        ]
+        listen = self.hass.bus.async_listen
+        stop = [listen(EVENT_DATA_ENTRY_FLOW_PROGRESS_UPDATE, progress)]
         try:
+            await asyncio.sleep(BROWSER)
+            stop.append(listen(EVENT_DATA_ENTRY_FLOW_PROGRESSED, progressed))
             async with asyncio.timeout(PATIENCE):
                 await done.wait()
         finally:

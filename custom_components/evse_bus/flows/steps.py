@@ -3,7 +3,7 @@
 from abc import abstractmethod
 import asyncio
 from collections.abc import Awaitable, Callable, Iterable, Mapping
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from homeassistant.config_entries import ConfigSubentry, ConfigSubentryData
 from homeassistant.const import CONF_ADDRESS, CONF_NAME
@@ -38,6 +38,13 @@ if TYPE_CHECKING:
     from ..evse.protocol import Progress, Protocol
     from ..evse.scan import FoundCharger
 
+
+SHOWN_FOR: Final = 1.5
+"""Shortest time a search is shown, s.
+
+The frontend subscribes to the event of the end only once it shows the progress; an
+event before that is lost, and the dialogue stays as it is for ever.
+"""
 
 type Step[ResultT] = Callable[[dict[str, Any] | None], Awaitable[ResultT]]
 """A step of a flow: takes the filled-in form, if any."""
@@ -116,12 +123,9 @@ class ChargerSteps[
     ) -> ResultT:
         """Search, and show the progress."""
         if self._scan_task is None:
-            # The flow manager cancels it when the flow is closed. It must not end
-            # at once: the manager would pass the last form to the step that follows.
+            # The flow manager cancels it when the flow is closed.
             self._scan_task = self.hass.async_create_background_task(
-                self.async_scan(self.async_update_progress),
-                "evse_bus search",
-                eager_start=False,
+                self._async_scan_visibly(), "evse_bus search"
             )
         if not self._scan_task.done():
             return self.async_show_progress(
@@ -136,6 +140,17 @@ class ChargerSteps[
             return self.async_show_progress_done(next_step_id=self.step_after_error)
         self._result = task.result()
         return self.async_show_progress_done(next_step_id=self._step_after_scan())
+
+    async def _async_scan_visibly(self) -> ScanResult:
+        """Search for `SHOWN_FOR` at least, also where the search fails."""
+        result, _ = await asyncio.gather(
+            self.async_scan(self.async_update_progress),
+            asyncio.sleep(SHOWN_FOR),
+            return_exceptions=True,
+        )
+        if isinstance(result, BaseException):
+            raise result
+        return result
 
     def _step_after_scan(self) -> str:
         if self._result.other_master:
