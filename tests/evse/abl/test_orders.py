@@ -226,7 +226,7 @@ async def test_a_lowered_limit_is_not_overtaken_by_the_write_under_way() -> None
         await until(lambda: 266 in scene.writes(LIMIT))
         written = len(scene.writes(LIMIT))
         # A reply is missed: the box is identified before the next write.
-        charger.on_missed(charger.slot.ready)
+        charger.on_missed(charger.slot.ready, "no reply")
         answer = box._answer
         lowering: list[asyncio.Task[None]] = []
 
