@@ -13,7 +13,7 @@ from custom_components.evse_bus.diagnostics import async_get_config_entry_diagno
 from custom_components.evse_bus.discovery import MOST_OFFERS
 from custom_components.evse_bus.evse.dialling import UnknownBox
 from custom_components.evse_bus.evse.readings import ChargerInfo
-from tests.common import bus_entry, get_entity, wait_for_state, wait_until
+from tests.common import bus_entry, get_entity, state_of, wait_for_state, wait_until
 from tests.flow import Flow, box as typed_box, fields, ignore, offers
 from tests.listening import (
     OTHER,
@@ -100,6 +100,7 @@ async def test_box_that_dials_is_offered_and_added(hass: HomeAssistant) -> None:
             for port in (1, 2):
                 status = await get_entity(hass, "sensor", entry, f"{port}_status")
                 await wait_for_state(hass, status, "available")
+            assert state_of(hass, "sensor.boxes_connected_boxes") == "1"
             # In place, and with the connection that was there.
             assert entry.runtime_data is running
             assert dialler.attempts == 1

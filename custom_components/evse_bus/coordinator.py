@@ -320,6 +320,8 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
             managed.subscriptions.append(
                 managed.bus.subscribe(partial(self._on_own_bus, managed))
             )
+            # A box that waited for its registration is connected already.
+            self._notify(BUS)
         managed.bus.add(charger)
         managed.subscriptions.append(charger.subscribe_events(managed.events.publish))
 
