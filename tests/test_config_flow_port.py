@@ -15,6 +15,7 @@ from custom_components.evse_bus.config_flow import EvseBusConfigFlow
 from custom_components.evse_bus.const import DOMAIN
 from custom_components.evse_bus.evse.protocols import PROTOCOLS, protocols_by_make
 from custom_components.evse_bus.flows.listener import ListenerOptionsFlow
+from custom_components.evse_bus.flows.search import is_same_port
 from custom_components.evse_bus.flows.subentry import ChargerSubentryFlow
 from tests.flow import IMPOSED, NOWHERE, charger, english, port_step
 from tests.virtual import (
@@ -142,6 +143,62 @@ async def test_one_port_is_one_bus(hass: HomeAssistant, tmp_path: Path) -> None:
         flow = await port_step(hass, "evbox", str(link))
         assert flow.result["type"] is FlowResultType.ABORT
         assert flow.result["reason"] == "already_configured"
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("socket://gw:4001", "socket://GW.local.:4001"),
+        ("socket://gw:4001", "socket://gw:4001/"),
+        ("socket://gw.local:4001", "rfc2217://gw:4001"),
+        ("socket://192.0.2.5:4001", "RFC2217://192.0.2.5:4001/"),
+        ("socket://[2001:db8::1]:4001", "socket://[2001:DB8:0::1]:4001"),
+    ],
+)
+async def test_network_port_in_two_spellings_is_one_port(
+    hass: HomeAssistant, one: str, other: str
+) -> None:
+    for first, second in ((one, other), (other, one)):
+        entry = MockConfigEntry(
+            domain=DOMAIN, data={"protocol": "abl", "device": first}
+        )
+        entry.add_to_hass(hass)
+        flow = await port_step(hass, "evbox", second)
+        assert flow.result["type"] is FlowResultType.ABORT
+        assert flow.result["reason"] == "already_configured"
+        await hass.config_entries.async_remove(entry.entry_id)
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("socket://gw:4001", "socket://gw:4002"),
+        ("socket://gw:4001", "socket://gw2:4001"),
+        ("socket://gw:bad", "socket://gw:worse"),
+        ("esphome://gw/?port_name=A", "esphome://gw/?port_name=B"),
+    ],
+)
+def test_other_addresses_are_other_ports(one: str, other: str) -> None:
+    assert not is_same_port(one, other)
+
+
+@pytest.mark.usefixtures("not_set_up")
+async def test_two_dialogues_for_one_port_in_two_spellings(
+    hass: HomeAssistant,
+) -> None:
+    with patch("custom_components.evse_bus.config_flow.async_try_port") as tried:
+        tried.return_value = None
+        flows = [
+            await port_step(hass, "evbox", url)
+            for url in ("socket://gw:4001", "rfc2217://GW.local:4001/")
+        ]
+        for flow in flows:
+            await flow.choose("manual")
+            await flow.submit({"serial_numbers": ["42"]})
+            await flow.submit(charger("Box", fail_safe_timeout=60))
+            await flow.submit()
+    assert flows[0].result["type"] is FlowResultType.CREATE_ENTRY
+    assert flows[1].result["reason"] == "already_configured"
 
 
 async def test_another_network_port_is_another_bus(hass: HomeAssistant) -> None:

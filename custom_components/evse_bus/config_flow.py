@@ -47,6 +47,7 @@ from .flows.search import (
     async_search,
     async_try_port,
     is_same_port,
+    is_same_url,
     port_name,
     probes,
     read_only_probe,
@@ -312,7 +313,10 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
         if self._listener is not None:
             return self.add_box(chargers)
         # Another flow may have added the bus in the meantime.
-        self._async_abort_entries_match({CONF_DEVICE: self.bus_data[CONF_DEVICE]})
+        device = self.bus_data[CONF_DEVICE]
+        for other in self._async_current_entries(include_ignore=False):
+            if is_same_url(device, other.data.get(CONF_DEVICE, "")):
+                return self.async_abort(reason="already_configured")
         return self.async_create_entry(
             title=_title(self.bus_data), data=self.bus_data, subentries=chargers
         )
