@@ -17,8 +17,9 @@ TIMING: Final = Timing(
     retry_pauses=(0.3, 1.0),
 )
 """On RS-232."""
-TCP_TIMING: Final = replace(TIMING, reply_timeout=2.0, reply_timeout_limit=5.0, gap=2.0)
-"""Over the network. The gap is the manual's own for TCP."""
+TCP_TIMING: Final = replace(TIMING, reply_timeout=2.0, reply_timeout_limit=2.5, gap=2.0)
+"""Over the network. The gap is the manual's own for TCP. With a longer time-out, a turn
+could take longer than the time left before `COMMAND_TIMEOUT`, and never begin."""
 
 COMMAND_TIMEOUT: Final = 30.0
 """A box ends the connection after so long without a command, s (3.1.4.2)."""
