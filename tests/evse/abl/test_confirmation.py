@@ -344,7 +344,8 @@ _steps = st.lists(
         st.sampled_from(
             [
                 *("on", "off", "6", "10", "16", "32", "0"),
-                *("foreign pause", "foreign limit", "power", "dead", "car"),
+                *["foreign pause"] * 8,
+                *("foreign limit", "power", "dead", "car"),
                 *("e0", "enable", "nothing"),
             ]
         ),
@@ -367,6 +368,8 @@ class Oracle:
         self.allow_until = -1.0
         self.changes = 0
         self.times: list[float] = []
+        self.violations: list[str] = []
+        """Collected: an error in the virtual box would not end the test."""
         outlet = box.outlet
         write = outlet.write_icmax
 
@@ -379,12 +382,16 @@ class Oracle:
     def check(self, code: int) -> None:
         box = self.box
         self.times.append(now())
-        assert code == PAUSE or 100 <= code <= 970, f"code {code}"
-        if box.tells_icmax:
-            assert code == PAUSE or code <= box.outlet.default, "above its default"
-        if self.foreign and code != PAUSE:
+        if code != PAUSE and not 100 <= code <= 970:
+            self.violations.append(f"code {code}")
+        if box.tells_icmax and PAUSE != code > box.outlet.default:
+            self.violations.append(f"code {code} above the default")
+        # By going to E0 some boxes may forget it.
+        stands = self.foreign and box.outlet.icmax_shown == PAUSE
+        if stands and code != PAUSE:
             seen = box.tells_icmax or (box.state[0] in "ABE" and not self.blind)
-            assert now() < self.allow_until or not seen, "ended a foreign pause"
+            if seen and now() >= self.allow_until:
+                self.violations.append("a foreign pause ended")
         self.foreign = False
 
     def bounded(self) -> None:
@@ -410,7 +417,8 @@ async def _step(  # noqa: C901
     elif name == "foreign pause":
         box.set_by_other_master(0)
         box.outlet._effects = []
-        oracle.foreign = True
+        # While ours is ordered as well, no register tells the two apart.
+        oracle.foreign = not charger.setpoint.paused
     elif name == "foreign limit":
         box.set_by_other_master(8)
         oracle.foreign = False
@@ -443,7 +451,7 @@ def _made(draw: dict[str, Any]) -> AblBox:
 
 
 @settings(
-    max_examples=25,
+    max_examples=40,
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow],
     phases=(Phase.explicit, Phase.reuse, Phase.generate),
@@ -475,5 +483,6 @@ def test_any_box_and_any_sequence(
             if charger.orders.allowed is False and box.state[0] in "ABCE":
                 assert box.outlet.icmax == PAUSE
             oracle.bounded()
+            assert oracle.violations == []
 
     simulate(scene_of())
