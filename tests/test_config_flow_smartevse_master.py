@@ -75,6 +75,8 @@ async def test_slaves_are_found_and_added(hass: HomeAssistant) -> None:
         assert flow.progress[-1] == 1
         assert flow.step == "select"
         assert fields(flow) == {"chargers": ["2", "4"], "installation_limit": 16}
+        options = flow.result["data_schema"].schema["chargers"].config["options"]
+        assert [one["label"].split(":")[0] for one in options] == ["Slave 1", "Slave 3"]
         await bus.wait_for_async(lambda: not bus.connected)
         # A search only reads: no broadcast either.
         for box in boxes:
@@ -82,9 +84,9 @@ async def test_slaves_are_found_and_added(hass: HomeAssistant) -> None:
             assert not box.broadcasts
 
         await flow.submit({"chargers": ["2", "4"], "installation_limit": 16})
-        assert flow.tells("Charger 1 of 2", "firmware 2.17 at 2")
+        assert flow.tells("Charger 1 of 2", "firmware 2.17 at Slave 1")
         assert fields(flow) == {
-            "name": "SmartEVSE 2",
+            "name": "SmartEVSE Slave 1",
             "installation_limit": 16,
             "fail_safe_current": 6,
             "expert": {"poll_interval": 2, "voltage": 230},
@@ -96,7 +98,9 @@ async def test_slaves_are_found_and_added(hass: HomeAssistant) -> None:
         await flow.reload()
         assert flow.step == "confirm_smartevse_master"
         table = flow.result["description_placeholders"]["chargers"]
-        assert table == "| Left | 2 | 16 A | 6 A |\n| Right | 4 | 13 A | 6 A |"
+        assert (
+            table == "| Left | Slave 1 | 16 A | 6 A |\n| Right | Slave 3 | 13 A | 6 A |"
+        )
         assert flow.tells("25 A per phase", "less than 7 A", "for 10 s")
         await flow.submit()
 
@@ -164,7 +168,7 @@ async def test_firmware_that_cannot_be_a_slave_is_told(
         assert flow.step == "unsupported"
         assert flow.result["menu_options"] == ["scan", "manual", "port"]
         told = flow.result["description_placeholders"]["chargers"]
-        assert told.startswith("- 3: ")
+        assert told.startswith("- Slave 2: ")
         assert f"firmware {dialect}" in told
         assert flow.tells("firmware 2.17", "LOAD BAL to Disabled")
         # It is not added by hand without a word, either: what it is was told.
@@ -188,7 +192,7 @@ async def test_two_boxes_with_one_unit_are_told(hass: HomeAssistant) -> None:
     with VirtualBus.in_loop(*twins, slave(3)) as bus:
         flow = await searched(hass, bus)
         assert flow.step == "duplicates"
-        assert flow.tells("at 2 on", "a number of its own")
+        assert flow.tells("at Slave 1 on", "a number of its own")
         await flow.choose("select")
         assert fields(flow)["chargers"] == ["3"]
         flow.abort()

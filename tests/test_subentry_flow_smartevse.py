@@ -81,7 +81,7 @@ async def test_slave_is_added_to_a_bus_that_runs(hass: HomeAssistant) -> None:
         assert flow.progress[-1] == 1
         assert not second.writes
         await flow.submit({"chargers": "3"})
-        assert flow.tells("firmware 2.17 at 3")
+        assert flow.tells("firmware 2.17 at Slave 2")
         await flow.submit(charger("New", 13))
         assert flow.step == "confirm_smartevse_master"
         assert flow.tells("allowed 20 A per phase", "for 10 s")

@@ -1,7 +1,8 @@
 """Address forms: how people name the place of a charger on a protocol's bus."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import override
 
 from .scan import Address
@@ -46,6 +47,10 @@ class AddressForm(ABC):
     def show(self, address: Address) -> str:
         """Return an address as it is printed on the charger."""
 
+    def label(self, address: Address) -> str:
+        """Return an address as people set it on the charger."""
+        return self.show(address)
+
     def serial(self, address: Address) -> str | None:
         """Return the serial number that an address stands for, if it is one."""
         if not self.is_serial or address == self.any:
@@ -63,6 +68,8 @@ class NumberAddress(AddressForm):
     """Digits it is shown with, zeros in front."""
     labelled: bool = False
     """Each number has a text of its own, under the key of the form."""
+    menu: Mapping[int, str] = field(default_factory=dict)
+    """Settings in the menu of the charger that stand for numbers."""
 
     @override
     def parse(self, text: object) -> int:
@@ -76,6 +83,10 @@ class NumberAddress(AddressForm):
     @override
     def show(self, address: Address) -> str:
         return f"{address:0{self.digits}d}"
+
+    @override
+    def label(self, address: Address) -> str:
+        return self.menu.get(int(address)) or self.show(address)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

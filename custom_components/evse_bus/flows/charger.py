@@ -82,7 +82,7 @@ class Candidate:
             (found.maximum_currents or (found.maximum_current,)) if found else (None,)
         )
         return {
-            "address": protocol.address.show(self.address),
+            "address": protocol.address.label(self.address),
             "model": model_name(found) if found else "?",
             "firmware": (found and found.info.firmware) or "?",
             "serial": self.serial(protocol) or "?",
@@ -111,7 +111,10 @@ def default_name(protocol: Protocol, address: Address) -> str:
     form = protocol.address
     if form.single:
         return protocol.make.name
-    return f"{protocol.make.name} {form.show(address)[-_NAME_DIGITS:]}"
+    label = form.label(address)
+    if form.is_serial:
+        label = label[-_NAME_DIGITS:]
+    return f"{protocol.make.name} {label}"
 
 
 # -- The form --------------------------------------------------------------------
@@ -310,7 +313,7 @@ def confirm_row(protocol: Protocol, charger: ConfigSubentryData) -> str:
     limits = [f"{data[key]:g} A" for key in PORT_LIMITS if key in data]
     cells = [
         charger["title"].replace("|", "/"),
-        protocol.address.show(data[CONF_ADDRESS]) or NO,
+        protocol.address.label(data[CONF_ADDRESS]) or NO,
         " + ".join(limits),
         f"{data[CONF_FAIL_SAFE_CURRENT]:g} A",
     ]

@@ -309,11 +309,11 @@ def found_options(
     protocol: Protocol, found: Iterable[FoundCharger]
 ) -> list[SelectOptionDict]:
     """Return the chargers found as options to choose from."""
-    show = protocol.address.show
+    label = protocol.address.label
     return [
         SelectOptionDict(
             value=str(one.address),
-            label=f"{show(one.address)}: {model_name(one)}"
+            label=f"{label(one.address)}: {model_name(one)}"
             + (f" ({one.serial})" if one.serial else ""),
         )
         for one in found

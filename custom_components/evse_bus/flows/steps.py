@@ -200,8 +200,8 @@ class ChargerSteps[
         user_input: dict[str, Any] | None = None,  # noqa: ARG002
     ) -> ResultT:
         """Report that several chargers answer at one address."""
-        show = self.protocol.address.show
-        addresses = ", ".join(show(one) for one in self._result.duplicates)
+        label = self.protocol.address.label
+        addresses = ", ".join(label(one) for one in self._result.duplicates)
         first = ("select",) if self._new() else ()
         return self._menu("duplicates", first, addresses=addresses)
 
@@ -210,9 +210,9 @@ class ChargerSteps[
         user_input: dict[str, Any] | None = None,  # noqa: ARG002
     ) -> ResultT:
         """Report chargers whose firmware this protocol does not support."""
-        show = self.protocol.address.show
+        label = self.protocol.address.label
         chargers = "\n".join(
-            f"- {show(one.address)}: {model_name(one)}"
+            f"- {label(one.address)}: {model_name(one)}"
             for one in self._result.unsupported
         )
         first = ("select",) if self._new() else ()

@@ -70,7 +70,13 @@ MASTER: Final = Protocol(
     scan=scan_slaves,
     master=Master,
     address=NumberAddress(
-        key="slave", lowest=2, highest=4, labelled=True, has_serial=False
+        key="slave",
+        lowest=2,
+        highest=4,
+        labelled=True,
+        # Setting LOAD BAL.
+        menu={2: "Slave 1", 3: "Slave 2", 4: "Slave 3"},
+        has_serial=False,
     ),
     # Three boxes at most; the minimum as in the menu of a box (MIN).
     circuit=CircuitRange(highest=3 * MAXIMUM_CURRENT, highest_minimum=16),
