@@ -1,6 +1,6 @@
 """One line's scheduler: one task owns the line, one exchange at a time.
 
-`schedule.choose` decides who speaks next, `exchange.Wire` has the exchange, and
+`schedule.choose` picks the next turn, `exchange.Wire` has the exchange, and
 `jobs.JobQueue` the commands; this module has the turns: presence, deadlines,
 reopening of a lost port.
 """
@@ -251,7 +251,7 @@ class Bus(Observable):
         return asyncio.get_running_loop().time()
 
     def reschedule(self) -> None:
-        """Choose anew who speaks next: something has changed."""
+        """Choose the next turn anew: something has changed."""
         self._timer.wake()
 
     def _update_worst_cases(self) -> None:
@@ -511,7 +511,7 @@ class Bus(Observable):
             charger.set_unavailable(why)
 
     async def _reopen(self) -> bool:
-        """Open the port again, however long it takes; False when told to stop.
+        """Open the port again, however long it takes; False when the bus stops.
 
         At once where its connection has worked until now.
         """

@@ -86,7 +86,7 @@ class Scheduler(Protocol):
         """Return the longest time one turn of a charger can take, s."""
 
     def reschedule(self) -> None:
-        """Choose anew who speaks next: something has changed."""
+        """Choose the next turn anew: something has changed."""
 
     def silence(self, why: str) -> None:
         """Fail all waiting commands; drop all readings."""
@@ -175,8 +175,8 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
     @property
     def pause_reason(self) -> PauseReason | None:
         """Return why no car is charged now; ``None``: its orders let one charge."""
-        told = self.reading.allowed if self.reading is not None else None
-        if told is False and not self.waits_for_current:
+        allowed = self.reading.allowed if self.reading is not None else None
+        if allowed is False and not self.waits_for_current:
             return PauseReason.NOT_ALLOWED
         inputs = (self.effective_orders, self.limits)
         if self._reason is None or self._reason[0] != inputs:
@@ -550,7 +550,7 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         return self.events.subscribe(listener)
 
     def notice(self, fault: Fault, *, present: bool) -> None:
-        """Set or clear a fault found by this library; listeners hear of a change."""
+        """Set or clear a fault found by this library; a change calls the listeners."""
         if present != (fault in self.noticed):
             self.noticed = self.noticed ^ {fault}
             self.updated()

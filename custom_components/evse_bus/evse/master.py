@@ -82,7 +82,7 @@ class BusMaster(ChargerGroup, Observable, ABC):
         """
 
     def notice(self, fault: Fault, *, present: bool) -> None:
-        """Set or clear a fault of the whole bus; listeners hear of a change."""
+        """Set or clear a fault of the whole bus; a change calls the listeners."""
         if present != (fault in self.noticed):
             self.noticed = self.noticed ^ {fault}
             self.updated()

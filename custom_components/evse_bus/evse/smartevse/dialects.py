@@ -163,7 +163,7 @@ def _read(register: int, words: int) -> Block:
 
 
 PROBE_A0: Final = _read(0xA0, 9)
-"""Status of 2.17 and 2.20; the state as a letter or as a number tells which."""
+"""Status of 2.17 and 2.20; the type of the state, letter or number, differs."""
 PROBE_A9: Final = Block(0xA9, 3, READ_HOLDING_REGISTERS)
 """Only 2.20 has these, and only from 2.20 on is 0x03 answered."""
 
