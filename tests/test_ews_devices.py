@@ -140,11 +140,11 @@ async def test_a_second_port_comes_and_goes(hass: HomeAssistant) -> None:
         assert (state_of(hass, status), state_of(hass, one)) == ("charging", "on")
         assert bus.opened == opened
         assert not ir.async_get(hass).issues
-        # A port that comes back begins with the fail-safe current.
+        # A port that comes back has the orders that it had.
         use_ports(hass, entry, 2)
         two = await get_entity(hass, "number", entry, "2_charging_current")
-        await wait_for_state(hass, two, "6.0")
-        await bus.wait_for_async(lambda: box.ports[1].limit == 6)
+        await wait_for_state(hass, two, "12.0")
+        await bus.wait_for_async(lambda: box.ports[1].limit == 12)
         assert not ir.async_get(hass).issues
 
 
