@@ -9,10 +9,12 @@ import os
 from pathlib import Path
 import socket
 import tty
+from unittest.mock import AsyncMock, Mock, patch
 
 from hypothesis import given, strategies as st
 import pytest
 
+from custom_components.evse_bus.evse import line as module
 from custom_components.evse_bus.evse.errors import (
     LineError,
     LineLostError,
@@ -227,6 +229,31 @@ async def test_closing_is_no_loss() -> None:
         await line.close()
         await asyncio.sleep(0)
         assert ear.lost == []
+
+
+async def test_a_closed_connection_that_ends_late_is_not_the_next_one() -> None:
+    """Where closing takes too long, its end comes when the next one is open."""
+    receivers: list[asyncio.Protocol] = []
+
+    async def connect(
+        _loop: object, factory: Callable[[], asyncio.Protocol], _url: str, **_: object
+    ) -> tuple[Mock, asyncio.Protocol]:
+        receivers.append(factory())
+        return Mock(wait_closed=AsyncMock()), receivers[-1]
+
+    line = Line("port", SETTINGS)
+    ear = Ear(line)
+    with patch.object(module, "create_serial_connection", connect):
+        await line.open()
+        await line.close()
+        await line.open()
+    receivers[0].connection_lost(None)
+    receivers[0].data_received(b"old")
+    assert line.is_open
+    assert ear.lost == []
+    assert not ear.data
+    receivers[1].connection_lost(None)
+    assert not line.is_open
 
 
 @pytest.mark.usefixtures("socket_enabled")

@@ -98,6 +98,8 @@ class Line:
         self.echoes: bool | None = None
         """Whether the adapter echoes our own bytes; ``None``: not known yet."""
         self._transport: BaseSerialTransport | None = None
+        self._receiver: _Receiver | None = None
+        """Of the connection that is open or being opened."""
         self._echo = b""
         self._held = 0
 
@@ -113,11 +115,12 @@ class Line:
         PortSettingsError or LineError.
         """
         loop = asyncio.get_running_loop()
+        self._receiver = receiver = _Receiver(self)
         try:
             async with asyncio.timeout(OPEN_TIMEOUT):
                 transport, _ = await create_serial_connection(
                     loop,
-                    lambda: _Receiver(self),
+                    lambda: receiver,
                     self.url,
                     baudrate=self.settings.baudrate,
                     parity=_PARITIES[self.settings.parity],
@@ -212,15 +215,25 @@ class Line:
 
 
 class _Receiver(asyncio.Protocol):
-    """Passes the events of serialx to the line."""
+    """Passes the events of one serialx connection to the line.
+
+    One that was closed may deliver its last events when the next one is open: they are
+    not of that one.
+    """
 
     def __init__(self, line: Line) -> None:
         self._line = line
 
+    @property
+    def _is_current(self) -> bool:
+        return self._line._receiver is self  # noqa: SLF001 - one object in two classes
+
     @override
     def data_received(self, data: bytes) -> None:
-        self._line._received(data)  # noqa: SLF001 - one object in two classes
+        if self._is_current:
+            self._line._received(data)  # noqa: SLF001 - one object in two classes
 
     @override
     def connection_lost(self, exc: Exception | None) -> None:
-        self._line._lost(exc)  # noqa: SLF001 - one object in two classes
+        if self._is_current:
+            self._line._lost(exc)  # noqa: SLF001 - one object in two classes
