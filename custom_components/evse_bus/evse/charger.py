@@ -1,4 +1,4 @@
-"""What all chargers share, in any protocol: orders, presence, turns on the bus.
+"""The common part of all chargers: orders, presence, turns on the bus.
 
 A protocol folder's charger derives from `Charger` and adds the conversations: what to
 ask, what to check, what to repeat. The rules for orders live here, so that they hold
@@ -133,7 +133,7 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         self._clamped: tuple[tuple[Orders, Limits], Setpoint] | None = None
         self._reason: tuple[tuple[Orders, Limits], PauseReason | None] | None = None
 
-    # -- What it is and has ------------------------------------------------------
+    # -- Configuration and state -------------------------------------------------
 
     @property
     def config(self) -> C:

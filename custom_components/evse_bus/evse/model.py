@@ -117,7 +117,7 @@ class PauseReason(StrEnum):
 
 
 class OrderState(StrEnum):
-    """What a charger's registers prove about the order that stands."""
+    """Evidence of the registers for the order that stands."""
 
     CONFIRMED = "confirmed"
     NOT_READ_BACK = "not_read_back"
@@ -177,7 +177,7 @@ class Capability(StrEnum):
 
 
 class FailSafe(StrEnum):
-    """What a charger does when no message comes from its controller."""
+    """Reaction of a charger to missing messages of its controller."""
 
     NOTHING = "nothing"
     """The last limit stays in effect."""
@@ -226,7 +226,7 @@ class Command(StrEnum):
 
 
 class Mode(StrEnum):
-    """What determines the current that a charger offers (SmartEVSE, register 0xA8)."""
+    """The source of the current that a charger offers (SmartEVSE, register 0xA8)."""
 
     NORMAL = "normal"
     """The limit alone."""
@@ -303,7 +303,7 @@ class Orders:
     fail_safe_timeout: int = 60
     """Time without messages after which it falls back, s (EVBox only)."""
     remembered: Mapping[str, str] = field(default_factory=dict)
-    """What the protocol has to know after a restart, by its own names."""
+    """State of the protocol that survives a restart, by its own names."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -92,7 +92,7 @@ class Protocol[C: ChargerConfig = Any]:
     group: Callable[[], ChargerGroup] | None = None
     """Makes the owner of what the chargers of one bus share, where they are one box."""
 
-    # -- What a user is asked for ----------------------------------------------------
+    # -- Input of the user -----------------------------------------------------------
 
     address: AddressForm
     options: tuple[Option, ...] = ()

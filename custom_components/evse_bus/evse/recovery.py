@@ -17,7 +17,7 @@ one for ever: the chargers may simply be off."""
 
 
 class LineRecovery:
-    """What is known of a line that may be dead. All times are loop times, s."""
+    """Evidence that a line is dead or works. All times are loop times, s."""
 
     def __init__(self) -> None:
         """Start with a line that was never open."""

@@ -1,4 +1,4 @@
-"""What the registers of a box prove about an order, and whether it is written again.
+"""Evidence of the registers for an order, and whether it is written again.
 
 Icmax is read back in word 3 of register 0x000F. The Ic of 0x002E shows a lower limit,
 but not a pause: it then stays at Idefault (PROTOCOLS.md, 2). Not every box answers
@@ -43,7 +43,7 @@ _HIGHEST: Final = 0x3CA
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evidence:
-    """What was read from a box."""
+    """The registers read from a box."""
 
     state: int
     """State byte."""
@@ -90,7 +90,7 @@ class Standing:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Decision:
-    """What is known about an order, and what has to be done."""
+    """A decision about an order: its evidence, and the action."""
 
     state: OrderState | None
     """``None``: nothing can be known in this state."""

@@ -413,7 +413,7 @@ class AblReader(Charger[AblConfig]):
         if self._info is not None:
             self.info = charger_info(self._info, self._serial, self._flags)
 
-    # -- What the registers prove --------------------------------------------------
+    # -- Evidence of the registers -------------------------------------------------
 
     @property
     def code(self) -> int:

@@ -26,7 +26,7 @@ E3: Final = 0xE3
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """What follows from a state alone; ``None``: unknown."""
+    """Properties of a state; ``None``: not known from the state alone."""
 
     name: str
     """As in the manual; of an unknown state its byte in hex."""

@@ -89,7 +89,7 @@ async def recover(reader: AblReader, turn: Turn, *, was_disabled: bool) -> Readi
     A reset ends in A1 with Idefault: neither the limit nor E0 has survived it.
     """
     status = await _wait_for_boot(reader, turn)
-    # It allows charging now, whoever had paused it: no pause can be ended.
+    # It allows charging now: no pause is left that could be ended.
     status = await lower_limit(reader, turn, status, is_reset=True)
     if was_disabled:
         return await disable(reader, turn, status)

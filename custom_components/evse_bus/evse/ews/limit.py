@@ -32,7 +32,7 @@ class Limiter:
     """Sends the limit of one port, and checks that the box follows it."""
 
     def __init__(self, port: BoxPort) -> None:
-        """Take the port to speak through."""
+        """Take the port that sends."""
         self._port = port
         self._confirmed: int | None = None
         """The last limit that was sent, and read back at it or below it, A."""

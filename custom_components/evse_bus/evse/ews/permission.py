@@ -158,7 +158,7 @@ class Permission:
     """Pauses and starts the charges of one port, and follows whose pause it is in."""
 
     def __init__(self, port: BoxPort) -> None:
-        """Take the port to speak through."""
+        """Take the port that sends."""
         self._port = port
         self._tracker = PauseTracker()
         self._started_at = -inf

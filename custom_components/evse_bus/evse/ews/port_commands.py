@@ -97,7 +97,7 @@ class PortCommands:
     """The commands of one port."""
 
     def __init__(self, port: BoxPort, permission: Permission) -> None:
-        """Take the port to speak through.
+        """Take the port that sends.
 
         ``permission`` is informed of a charge that a command stops or unlocks.
         """

@@ -48,7 +48,7 @@ class Services:
     """
 
     def __init__(self, port: BoxPort) -> None:
-        """Take the port to speak through."""
+        """Take the port that sends."""
         self._port = port
 
     # -- Cards ---------------------------------------------------------------------

@@ -288,7 +288,7 @@ class Listener:
     async def _may_replace(
         self, found: UnknownBox, box: _RegisteredBox, connection: Connection
     ) -> bool:
-        """Return whether this connection may be the box's: the old one is asked."""
+        """Return whether this connection may be the box's; checks the old one."""
         line, serial = box.line, found.serial
         if not line.is_open:
             return True
