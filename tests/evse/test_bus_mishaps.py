@@ -9,9 +9,13 @@ from hypothesis import given, strategies as st
 import pytest
 
 from custom_components.evse_bus.evse import bus as bus_module
-from custom_components.evse_bus.evse.bus import FAILURES_LOGGED
+from custom_components.evse_bus.evse.bus import COMMAND_PATIENCE, FAILURES_LOGGED
 from custom_components.evse_bus.evse.conversation import rest
-from custom_components.evse_bus.evse.errors import LineLostError, NotAvailableError
+from custom_components.evse_bus.evse.errors import (
+    LineBusyError,
+    LineLostError,
+    NotAvailableError,
+)
 from custom_components.evse_bus.evse.exchange import Turn
 from custom_components.evse_bus.evse.model import OrderChange, Orders
 from custom_components.evse_bus.evse.safety import clamp
@@ -22,9 +26,10 @@ from custom_components.evse_bus.evse.statistics import (
     Direction,
     FrameLog,
 )
-from tests.simulated_time import simulate
+from tests.simulated_time import now, simulate
 
 from .telegram import Scene, SimulatedCharger, TelegramLine
+from .test_master import BeatScene
 
 
 class SlowCharger(SimulatedCharger):
@@ -354,3 +359,20 @@ def test_a_whole_read_of_noise_is_not_kept() -> None:
         log.add(Direction.UNREADABLE, bytes(256 * 1024))
     assert sum(sys.getsizeof(one.data) for one in log) < 80_000
     assert {one.length for one in log} == {256 * 1024}
+
+
+def test_a_command_for_which_the_bus_has_no_time_fails() -> None:
+    """Its worst case never fits before the next deadline: it waited for ever."""
+
+    async def scene() -> None:
+        scene = BeatScene(interval=1.0)
+        async with scene:
+            await asyncio.sleep(5)
+            charger = scene.charger(1)
+            charger.bus.worst_case = lambda _charger: 10.0  # type: ignore[method-assign, union-attr]
+            start = now()
+            with pytest.raises(LineBusyError):
+                await charger.change_orders(OrderChange(current=8.0))
+            assert now() - start < COMMAND_PATIENCE + 5
+
+    simulate(scene())

@@ -34,6 +34,8 @@ from .throttle import LogThrottle, RateLimiter
 
 _LOGGER = logging.getLogger(__name__)
 
+COMMAND_PATIENCE: Final = 120.0
+"""Longest time until a command begins, s; longer than any minimum interval."""
 STOP_PATIENCE: Final = 6.0
 """Longest time a stop waits for a conversation begun (waking a car: 3 s), s."""
 FAILURE_PAUSE: Final = 1.0
@@ -274,6 +276,7 @@ class Bus(Observable):
                     await self._renew()
                 if not self.line.is_open and not await self._reopen():
                     return
+                self._jobs.fail_older(self.now - COMMAND_PATIENCE)
                 slots = self._slots()
                 if self._stopping and not slots:
                     return

@@ -13,9 +13,9 @@ from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.framing import LineSettings
 from custom_components.evse_bus.evse.modbus import RtuFramer
 from custom_components.evse_bus.evse.model import Circuit, CurrentLimit, Orders
+from custom_components.evse_bus.evse.smartevse import MASTER
 from custom_components.evse_bus.evse.smartevse.config import SlaveConfig
 from custom_components.evse_bus.evse.smartevse.master import Master
-from custom_components.evse_bus.evse.smartevse.reader import TIMING
 from custom_components.evse_bus.evse.smartevse.slave import SlaveSmartEvse
 from tests.evse.simulated_line import LiveScene, SimulatedLine
 from tests.simulated_time import now
@@ -174,7 +174,9 @@ class MasterScene(LiveScene):
     def new_bus(self) -> None:
         """Restart the library; the boxes go on."""
         self.master = Master(Circuit(limit=self.limit, minimum=self.minimum))
-        self.bus = Bus(self.line, RtuFramer(), TIMING, "simulated", group=self.master)
+        self.bus = Bus(
+            self.line, RtuFramer(), MASTER.timing, "simulated", group=self.master
+        )
 
     def plug_box(self, unit: int, dialect: str = "2.17") -> Box:
         car = Car(max_current=32.0)
