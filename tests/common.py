@@ -2,9 +2,12 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Mapping
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from copy import deepcopy
 from functools import partial
+from itertools import count
+import os
+import socket
 from typing import Any
 
 from homeassistant.config_entries import (
@@ -171,6 +174,22 @@ async def running(
             if entry.state is ConfigEntryState.LOADED:
                 await hass.config_entries.async_unload(entry.entry_id)
                 await hass.async_block_till_done()
+
+
+_ports = count(os.getpid() * 7)
+
+
+def free_port() -> int:
+    """Return a TCP port that nobody uses, nor will by chance.
+
+    It lies below those that the kernel gives to connections, and other processes of
+    the tests begin elsewhere.
+    """
+    while True:
+        port = 10_000 + next(_ports) % 10_000
+        with socket.socket() as probe, suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return port
 
 
 async def crash(

@@ -3,7 +3,6 @@
 from collections.abc import AsyncIterator, Sequence
 from contextlib import ExitStack, asynccontextmanager
 import logging
-import socket
 from typing import Any
 
 from homeassistant.config_entries import ConfigEntryState, ConfigSubentryData
@@ -12,7 +11,7 @@ import pytest
 from pytest_homeassistant_custom_component.common import MockConfigEntry
 
 from custom_components.evse_bus.const import DOMAIN
-from tests.common import call, ews_charger, get_entity, wait_for_state
+from tests.common import call, ews_charger, free_port, get_entity, wait_for_state
 from tests.virtual import Car, EwsBox, EwsCommand, EwsDialler, VirtualBus
 
 HOST = "127.0.0.1"
@@ -95,14 +94,6 @@ def said(caplog: pytest.LogCaptureFixture, words: str) -> int:
         for record in caplog.records
         if record.levelno >= logging.WARNING and DOMAIN in record.name
     )
-
-
-def free_port() -> int:
-    """Return a port that nobody listens on."""
-    with socket.socket() as one:
-        one.bind((HOST, 0))
-        port: int = one.getsockname()[1]
-    return port
 
 
 def listener_entry(

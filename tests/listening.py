@@ -2,7 +2,6 @@
 
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
-import socket
 from typing import TYPE_CHECKING
 
 from homeassistant.config_entries import ConfigEntryState
@@ -84,11 +83,3 @@ async def offered(hass: HomeAssistant, serial: str = SERIAL) -> str:
     name = f"EWS-Box {serial}"
     await wait_until(hass, lambda: name in offers(hass))
     return offers(hass)[name]
-
-
-def free_port() -> int:
-    """Return a port that nobody uses at the moment."""
-    with socket.socket() as probe:
-        probe.bind((HOST, 0))
-        port: int = probe.getsockname()[1]
-        return port

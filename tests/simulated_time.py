@@ -12,7 +12,7 @@ from typing import Any, override
 
 NOW = 1000.0
 """Time at which a loop begins, s."""
-_REAL_WAIT = 0.0005
+_REAL_WAIT = 0.0001
 """Wait for sockets of this process before time goes on, real s."""
 
 
@@ -25,22 +25,25 @@ class _JumpingSelector(selectors.SelectSelector):
 
     @override
     def select(self, timeout: float | None = None) -> Any:
-        if timeout is not None and timeout <= 0:
-            return super().select(0)
-        if self._loop.jobs:
+        loop = self._loop
+        if loop.jobs and (timeout is None or timeout > 0):
             # A job in a thread takes no time.
+            loop.woken = False
             return super().select()
-        # One is the loop's own, for threads.
-        events = super().select(_REAL_WAIT if len(self.get_map()) > 1 else 0)
-        if events:
-            return events
+        if loop.woken or len(self.get_map()) > 1:
+            # One is the loop's own: other threads wake it through that.
+            loop.woken = False
+            wait = 0 if timeout is not None and timeout <= 0 else _REAL_WAIT
+            if events := super().select(wait):
+                return events
         if timeout is None:
             message = "everything waits for nothing"
             raise RuntimeError(message)
-        # A little more than asked for, as with a real clock: a timer may fire
-        # within the clock's resolution before its time, for ever if time stood.
-        self._loop.now += timeout + 1e-9
-        return events
+        if timeout > 0:
+            # A little more than asked for, as with a real clock: a timer may fire
+            # within the clock's resolution before its time, for ever if time stood.
+            loop.now += timeout + 1e-9
+        return []
 
 
 class SimulatedLoop(asyncio.SelectorEventLoop):
@@ -50,6 +53,8 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
         self.now = NOW
         self.jobs = 0
         """Jobs under way in threads."""
+        self.woken = False
+        """A thread has called something in the loop."""
         super().__init__(_JumpingSelector(self))
 
     @override
@@ -57,11 +62,24 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
         return self.now
 
     @override
+    def get_debug(self) -> bool:
+        """Return False: a traceback for each timer doubles the time of a test.
+
+        The debug mode still checks callbacks, and threads that call into the loop.
+        """
+        return False
+
+    @override
     def run_in_executor(self, executor: Any, func: Any, *args: Any) -> Any:
         future = super().run_in_executor(executor, func, *args)
         self.jobs += 1
         future.add_done_callback(self._job_done)
         return future
+
+    @override
+    def _write_to_self(self) -> None:
+        self.woken = True
+        super()._write_to_self()  # type: ignore[misc] # of a base class
 
     @override
     async def shutdown_default_executor(self, timeout: float | None = None) -> None:

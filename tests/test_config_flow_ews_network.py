@@ -10,13 +10,12 @@ from homeassistant.data_entry_flow import FlowResultType
 from homeassistant.exceptions import HomeAssistantError
 import pytest
 
-from tests.common import bus_entry, wait_until
+from tests.common import bus_entry, free_port, wait_until
 from tests.flow import Flow, ews_step, fields
 from tests.listening import (
     HOST,
     SERIAL,
     dialling,
-    free_port,
     listener_of,
     listening,
     stored_box,

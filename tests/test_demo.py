@@ -95,6 +95,7 @@ def shown(monkeypatch: pytest.MonkeyPatch) -> list[list[ListedBus]]:
     return saved
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick_search")
 async def test_buses_are_added_once_and_all_is_on_the_dashboard(
     hass: HomeAssistant,

@@ -186,6 +186,7 @@ async def run(code: str, *arguments: str) -> str:
     return out.decode()
 
 
+@pytest.mark.slow
 @pytest.mark.real_time
 async def test_the_script_of_the_library_reads_and_sets_a_charger() -> None:
     code = scripts("docs/library.md")[0]
@@ -201,6 +202,7 @@ async def test_the_script_of_the_library_reads_and_sets_a_charger() -> None:
         assert box.ic_amps <= 10.0
 
 
+@pytest.mark.slow
 @pytest.mark.real_time
 async def test_the_same_script_for_an_ews_box() -> None:
     code = scripts("docs/library.md")[0].replace('"abl"', '"ews"')
@@ -214,6 +216,7 @@ async def test_the_same_script_for_an_ews_box() -> None:
         assert not box.ports[0].contactor
 
 
+@pytest.mark.slow
 @pytest.mark.real_time
 @pytest.mark.usefixtures("socket_enabled")
 async def test_the_script_that_an_ews_box_dials(unused_tcp_port: int) -> None:

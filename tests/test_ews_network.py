@@ -15,6 +15,7 @@ from custom_components.evse_bus.evse.ews.network import line, listener as listen
 from tests.common import (
     call,
     ews_charger,
+    free_port,
     get_entity,
     state_of,
     wait_for_state,
@@ -27,7 +28,6 @@ from tests.ews import (
     START,
     charge,
     dialler_of,
-    free_port,
     limits,
     listener_entry,
     listening,

@@ -1,7 +1,7 @@
 """Setting up, changing and taking down a bus in Home Assistant."""
 
 import asyncio
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
 import socket
@@ -37,15 +37,14 @@ from tests.common import (
 from tests.virtual import AblBox, Car, VirtualBus, requests_in
 
 
-def open_files() -> set[str]:
-    """Return what this process has open, ptys and sockets by name."""
-    found = set()
+def is_open(url: str) -> bool:
+    """Return whether this process has a serial port open."""
+    port = Path(url).resolve()
     for link in Path("/proc/self/fd").iterdir():
-        try:
-            found.add(str(link.readlink()))
-        except FileNotFoundError:
-            continue
-    return found
+        with suppress(FileNotFoundError):
+            if link.readlink() == port:
+                return True
+    return False
 
 
 def bus_tasks() -> list[str]:
@@ -127,15 +126,16 @@ async def test_a_network_port_that_refuses(hass: HomeAssistant) -> None:
     assert entry.error_reason_translation_key == "port_missing"
 
 
+@pytest.mark.real_time
 async def test_unloading_leaves_nothing_open(hass: HomeAssistant) -> None:
-    with VirtualBus.in_loop(AblBox(1), AblBox(2)) as bus:
-        before = open_files()
+    with VirtualBus.pty(AblBox(1), AblBox(2)) as bus:
         entry = await setup_bus(
             hass, "abl", bus.url, charger("abl", 1), charger("abl", 2)
         )
         await get_entity(hass, "sensor", entry, "1_status")
         coordinator = entry.runtime_data
         assert bus_tasks()
+        assert is_open(bus.url)
         assert await hass.config_entries.async_unload(entry.entry_id)
         await hass.async_block_till_done()
         assert entry.state is ConfigEntryState.NOT_LOADED
@@ -143,7 +143,7 @@ async def test_unloading_leaves_nothing_open(hass: HomeAssistant) -> None:
         assert not coordinator._listeners
         # The other end sees it when the last of ours is closed.
         await bus.wait_for_async(lambda: not bus.connected)
-        assert open_files() <= before
+        assert not is_open(bus.url)
 
 
 async def test_unloading_while_the_adapter_is_gone(hass: HomeAssistant) -> None:

@@ -50,7 +50,8 @@ class EwsLine(SimulatedLine[Sent]):
         """Everything is lost."""
         self.held_until = 0.0
         """Bytes that the box sends before this time arrive then, in their order."""
-        self.lumps = 1
+        # As a serial adapter delivers them.
+        self.lumps = 16
         self._free_at = 0.0
 
     @override

@@ -9,6 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 
 from hypothesis import given, settings, strategies as st
+import pytest
 
 from custom_components.evse_bus.evse.errors import EvseError
 from custom_components.evse_bus.evse.model import Command, OrderChange
@@ -89,6 +90,7 @@ class Run:
             self.scene.unplug(value)
 
 
+@pytest.mark.slow
 @settings(max_examples=50)
 @given(
     acts=st.lists(ACTS, max_size=12) | st.lists(ACTS | UNLOCKS, max_size=12),

@@ -9,6 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 from hypothesis import given, settings, strategies as st
+import pytest
 
 from custom_components.evse_bus.evse.errors import EvseError
 from custom_components.evse_bus.evse.model import Command, OrderChange
@@ -205,6 +206,7 @@ PAUSES = st.sampled_from((0x50, 0x42))
 FLAGS = st.sampled_from(("read", "clock", "never"))
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(acts=acts_of(ON), pause_status=PAUSES, flag=FLAGS, begin=BEGINS)
 def test_nothing_is_unlocked_without_an_order(
@@ -213,6 +215,7 @@ def test_nothing_is_unlocked_without_an_order(
     judged(acts, pause_status=pause_status, flag=flag, begin=begin)
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(acts=acts_of(UNLOCK), pause_status=PAUSES, flag=FLAGS)
 def test_nothing_is_started_without_an_order(

@@ -9,6 +9,7 @@ from contextlib import suppress
 from random import Random
 
 from hypothesis import HealthCheck, given, settings, strategies as st
+import pytest
 
 from custom_components.evse_bus.evse.errors import EvseError
 from custom_components.evse_bus.evse.model import Circuit, OrderChange
@@ -93,6 +94,7 @@ async def act_on_bus(scene: MasterScene, what: str, unit: int) -> None:
                 await slave.change_orders(CHANGES[what])
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     story=acts,
@@ -121,6 +123,7 @@ def test_never_more_than_the_circuit_limit(
     simulate(scene())
 
 
+@pytest.mark.slow
 @settings(max_examples=15, deadline=None)
 @given(
     first=st.sampled_from((20.0, 32.0)),
