@@ -129,7 +129,7 @@ BUSES: Final = (
             *("smartevse", "--load-balance", "2", "3", "--max-current", "16"),
             *("--seed", "3", *_LIFE),
         ),
-        names={"2": "Barn left", "3": "Barn right"},
+        names={"Slave 1": "Barn left", "Slave 2": "Barn right"},
         currents={"Barn left": 16.0, "Barn right": 16.0},
         connectors=2,
         choose={

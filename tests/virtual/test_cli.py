@@ -19,6 +19,7 @@ from .raw_client import RawClient
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "virtual-chargers"
 READ_FULL = b":0103002E0005C9\r\n"
+READ_ICMAX = b":0103000F0005E8\r\n"
 PATIENCE = 30.0
 
 
@@ -56,12 +57,13 @@ def test_abl(tmp_path: Path) -> None:
             answers = [process.stdout.readline() for _ in range(3)]
             assert answers[:2] == ["ok\n", "ok\n"]
             assert answers[2].startswith("error nonsense 1: no such command")
-            answer = client.ask(READ_FULL)
-            assert answer[11:15] in (b"93E8", b"13E8")
+            # Paused, it still reports its default: only 0x0F has the pause.
+            assert client.ask(READ_FULL)[11:15] in (b"910A", b"110A")
+            assert client.ask(READ_ICMAX)[19:23] == b"03E8"
         process.send_signal(signal.SIGTERM)
         assert process.wait(PATIENCE) == 0
     counters = json.loads(stats.read_text())
-    assert counters["devices"]["abl-1"]["requests"] == 2
+    assert counters["devices"]["abl-1"]["requests"] == 3
     assert counters["devices"]["abl-2"]["requests"] == 0
     assert not link.exists()
 
