@@ -8,12 +8,18 @@ and the load of the machine changes nothing.
 import asyncio
 from collections.abc import Coroutine
 import selectors
+from time import process_time
 from typing import Any, override
 
 NOW = 1000.0
 """Time at which a loop begins, s."""
 _REAL_WAIT = 0.0001
 """Wait for sockets of this process before time goes on, real s."""
+_LONGEST = 120.0
+"""Processor time after which a loop hangs, s.
+
+What pytest-timeout raises ends a task or a callback, and the loop goes on.
+"""
 
 
 class _JumpingSelector(selectors.SelectSelector):
@@ -39,6 +45,9 @@ class _JumpingSelector(selectors.SelectSelector):
         if timeout is None:
             message = "everything waits for nothing"
             raise RuntimeError(message)
+        if process_time() > loop.ends_at:
+            message = f"no end after {_LONGEST:g} s of processor time"
+            raise RuntimeError(message)
         if timeout > 0:
             # A little more than asked for, as with a real clock: a timer may fire
             # within the clock's resolution before its time, for ever if time stood.
@@ -51,6 +60,7 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
 
     def __init__(self) -> None:
         self.now = NOW
+        self.ends_at = process_time() + _LONGEST
         self.jobs = 0
         """Jobs under way in threads."""
         self.woken = False
