@@ -214,11 +214,11 @@ def forget_orders(hass: HomeAssistant) -> None:
     """Drop all orders and totals from memory, also those that are not written yet."""
     store = hass.data.get(ORDERS)
     if store is not None:
-        store._stop_timer()
+        store._next_write.cancel()
         store._pending = False
     hass.data[ORDERS] = OrderStore(hass, partial(report_orders_written, hass))
     if (totals := hass.data.get(TOTALS)) is not None:
-        totals._stop_timer()
+        totals._next_write.cancel()
     hass.data[TOTALS] = TotalStore(hass)
 
 

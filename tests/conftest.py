@@ -37,6 +37,13 @@ settings.register_profile("evse_bus", deadline=None)
 settings.load_profile("evse_bus")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Give slow tests, and no others, more time before they count as hung."""
+    for item in items:
+        if item.get_closest_marker("slow"):
+            item.add_marker(pytest.mark.timeout(240))
+
+
 @pytest.fixture(autouse=True)
 def integration_can_load(request: pytest.FixtureRequest) -> None:
     """Let Home Assistant find the integration, in the tests that run it."""

@@ -275,4 +275,4 @@ async def test_what_the_disk_refuses_is_not_stored(
     await store.async_flush()
     assert store.stored("a") == store.get("a")
     assert hass_storage[TOTALS_KEY]["data"]["a"]["total"] == 5.0
-    store._stop_timer()
+    store._next_write.cancel()

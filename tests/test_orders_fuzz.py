@@ -132,7 +132,7 @@ class House:
 
     def down(self) -> None:
         if self.store is not None:
-            self.store._stop_timer()
+            self.store._next_write.cancel()
         self.store = self.orders = None
         self.disk.steps_left = None
 

@@ -69,7 +69,7 @@ class House:
         await store.async_load()
         orders = await store.async_begin((KEY,), FIRST, stopped(FIRST))
         if orders is None:
-            store._stop_timer()
+            store._next_write.cancel()
             return
         assert effective(orders) <= self.allowed
         self.word = orders
@@ -93,7 +93,7 @@ class House:
             file.disk = dead  # type: ignore[attr-defined]
         DiskFile.disk = self.disk
         self.disk.files = dict(dead.files)
-        self.life.store._stop_timer()
+        self.life.store._next_write.cancel()
         self.check()
         life, self.life = self.life, None
         await life.bus.stop()

@@ -13,19 +13,16 @@ of their own, written once `STEP` is new, at most once in `INTERVAL`, and at sto
 import asyncio
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import datetime
 from math import isfinite
 from typing import Any, Final
 
-from homeassistant.const import EVENT_HOMEASSISTANT_FINAL_WRITE
-from homeassistant.core import CALLBACK_TYPE, Event, HassJob, HomeAssistant, callback
-from homeassistant.helpers.event import async_call_later
+from homeassistant.core import HomeAssistant, callback
 from homeassistant.util.hass_dict import HassKey
 
 from .const import DOMAIN, LOGGER
 from .evse.listeners import Observable
 from .evse.meter import HIGHEST_CURRENT, most_energy
-from .storage import UNREADABLE, StoredFile
+from .storage import UNREADABLE, PlannedWrite, StoredFile
 
 TOTALS_KEY: Final = f"{DOMAIN}.totals"
 """File name in the storage folder of Home Assistant."""
@@ -188,11 +185,8 @@ class TotalStore(Observable):
         self._loaded = False
         self._failed = False
         self._written_at: float | None = None
-        self._cancel_timer: CALLBACK_TYPE | None = None
+        self._next_write = PlannedWrite(hass, self.async_flush)
         self._busy = asyncio.Lock()
-        hass.bus.async_listen_once(
-            EVENT_HOMEASSISTANT_FINAL_WRITE, self._async_final_write
-        )
 
     async def async_load(self) -> None:
         """Read the file, once; an unreadable one is treated as missing."""
@@ -244,7 +238,7 @@ class TotalStore(Observable):
     async def async_flush(self) -> None:
         """Write all records now, if any has changed."""
         async with self._busy:
-            self._stop_timer()
+            self._next_write.cancel()
             records = dict(self._records)
             if records == self._on_disk:
                 return
@@ -263,30 +257,10 @@ class TotalStore(Observable):
         self.updated()
 
     def _write_soon(self) -> None:
-        if self._cancel_timer is not None:
-            return
         pause = 0.0
         if self._written_at is not None:
             pause = self._written_at + INTERVAL - self._hass.loop.time()
-        self._cancel_timer = async_call_later(
-            self._hass,
-            max(pause, 0.0),
-            HassJob(self._async_on_timer, cancel_on_shutdown=True),
-        )
-
-    async def _async_on_timer(self, _now: datetime) -> None:
-        self._cancel_timer = None
-        await self.async_flush()
-
-    @callback
-    def _stop_timer(self) -> None:
-        if self._cancel_timer is not None:
-            self._cancel_timer()
-            self._cancel_timer = None
-
-    async def _async_final_write(self, _event: Event) -> None:
-        await self.async_flush()
-        self._stop_timer()
+        self._next_write.plan(max(pause, 0.0))
 
 
 TOTALS: Final[HassKey[TotalStore]] = HassKey(TOTALS_KEY)

@@ -19,19 +19,12 @@ stay when the charger moves to another bus or is removed and added again.
 import asyncio
 from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime
 from functools import reduce
 from typing import Any, Final
 
-from homeassistant.const import EVENT_HOMEASSISTANT_FINAL_WRITE
 from homeassistant.core import (
-    CALLBACK_TYPE,
-    Event,
-    HassJob,
     HomeAssistant,
-    callback,
 )
-from homeassistant.helpers.event import async_call_later
 from homeassistant.util.hass_dict import HassKey
 
 from .const import DOMAIN, LOGGER
@@ -40,7 +33,7 @@ from .evse.listeners import Observable
 from .evse.model import ChargerConfig, CurrentLimit, Orders, Phases
 from .evse.protocol import Protocol
 from .evse.safety import cautious, number
-from .storage import UNREADABLE, StoredFile
+from .storage import UNREADABLE, PlannedWrite, StoredFile
 
 ORDERS_KEY: Final = f"{DOMAIN}.orders"
 KNOWN_KEY: Final = f"{DOMAIN}.known_chargers"
@@ -183,12 +176,9 @@ class OrderStore(Observable):
         self._known_on_disk: frozenset[str] = frozenset()
         self._pending = False
         self._retry_pause = RETRY_FIRST
-        self._cancel_timer: CALLBACK_TYPE | None = None
+        self._next_write = PlannedWrite(hass, self.async_flush)
         self._busy = asyncio.Lock()
         """Held while a file is read or written."""
-        hass.bus.async_listen_once(
-            EVENT_HOMEASSISTANT_FINAL_WRITE, self._async_final_write
-        )
 
     async def async_load(self) -> None:
         """Read the files, once; an unreadable one is treated as missing."""
@@ -339,7 +329,7 @@ class OrderStore(Observable):
         self._known.add(key)
         self._pending = True
         if before is not None and allows_more(order, before.order):
-            self._write_later(RAISE_DELAY)
+            self._next_write.plan(RAISE_DELAY)
         else:
             await self.async_flush()
 
@@ -374,7 +364,7 @@ class OrderStore(Observable):
         async with self._busy:
             if not self._pending and self._known == self._known_on_disk:
                 return
-            self._stop_timer()
+            self._next_write.cancel()
             self._pending = False
             error = await self._async_write_files()
             if error is None:
@@ -385,7 +375,7 @@ class OrderStore(Observable):
                 if not self._failed:
                     LOGGER.error("Orders cannot be stored: %s", error)
                 self._failed = True
-                self._write_later(self._retry_pause)
+                self._next_write.plan(self._retry_pause)
                 self._retry_pause = min(self._retry_pause * 2, RETRY_LIMIT)
         self._on_write(error)
         if error is None:
@@ -439,30 +429,6 @@ class OrderStore(Observable):
                 LOGGER.debug("The stored orders cannot be deleted: %s", error)
             else:
                 self._on_disk = {}
-
-    def _write_later(self, delay: float) -> None:
-        """Write after a delay, unless a write is planned already."""
-        if self._cancel_timer is None:
-            self._cancel_timer = async_call_later(
-                self._hass,
-                delay,
-                HassJob(self._async_on_timer, cancel_on_shutdown=True),
-            )
-
-    async def _async_on_timer(self, _now: datetime) -> None:
-        self._cancel_timer = None
-        await self.async_flush()
-
-    @callback
-    def _stop_timer(self) -> None:
-        if self._cancel_timer is not None:
-            self._cancel_timer()
-            self._cancel_timer = None
-
-    async def _async_final_write(self, _event: Event) -> None:
-        """Try once more, at the end of a stop of Home Assistant."""
-        await self.async_flush()
-        self._stop_timer()
 
 
 ORDERS: Final[HassKey[OrderStore]] = HassKey(ORDERS_KEY)

@@ -259,6 +259,10 @@ class Bus(Observable):
     def _update_worst_cases(self) -> None:
         for charger in self.chargers.values():
             charger.slot.worst_case = self.worst_case(charger)
+        for job in self._jobs:
+            owner = self._charger_of(job)
+            if owner is not None and job.change is not None:
+                job.worst_case = self.worst_case(owner)
 
     def worst_case(self, charger: Charger) -> float:
         """Return the longest time one turn of a charger can take, s."""

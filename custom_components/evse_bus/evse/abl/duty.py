@@ -30,7 +30,6 @@ PAUSE: Final = 0x3E8
 _LOWEST: Final = 80
 _MINIMUM: Final = 100
 _LOWER_END: Final = 850
-_UPPER_END: Final = 960
 _TOLERATED_END: Final = 970
 _UPPER_BEGIN: Final = Decimal("52.5")
 
