@@ -204,7 +204,7 @@ async def test_a_port_that_is_taken(hass: HomeAssistant) -> None:
         # What helps to find out why can be downloaded all the same.
         told = await async_get_config_entry_diagnostics(hass, entry)
         assert [one["bus"]["connected"] for one in told["boxes"]] == [False]
-    await hass.config_entries.async_reload(entry.entry_id)
+    await asyncio.sleep(10)
     assert entry.state is ConfigEntryState.LOADED
     with dialler_of(entry, box):
         await get_entity(hass, "sensor", entry, "1_status")

@@ -9,7 +9,12 @@ from types import MappingProxyType
 from typing import Any
 from unittest.mock import patch
 
-from homeassistant.config_entries import ConfigEntry, ConfigEntryState, ConfigSubentry
+from homeassistant.config_entries import (
+    ConfigEntry,
+    ConfigEntryDisabler,
+    ConfigEntryState,
+    ConfigSubentry,
+)
 from homeassistant.const import EVENT_HOMEASSISTANT_STOP
 from homeassistant.core import HomeAssistant
 from homeassistant.helpers import (
@@ -115,6 +120,59 @@ async def test_a_port_that_cannot_be_opened(
     assert entry.state is ConfigEntryState.SETUP_RETRY
     assert entry.error_reason_translation_key == key
     assert not bus_tasks()
+
+
+@pytest.mark.parametrize("away", [3.0, 61.0, 601.0, 3600.0])
+async def test_an_adapter_that_is_away_at_the_start(
+    hass: HomeAssistant, away: float
+) -> None:
+    """Home Assistant's own pauses would be up to 10 min long."""
+    with VirtualBus.in_loop(AblBox(1)) as bus:
+        bus.unplug()
+        entry = await setup_bus(hass, "abl", bus.url, charger("abl", 1))
+        assert entry.state is ConfigEntryState.SETUP_RETRY
+        await asyncio.sleep(away)
+        assert entry.state is ConfigEntryState.SETUP_RETRY
+        # It is tried quietly: the reason stays shown.
+        assert entry.error_reason_translation_key == "port_missing"
+        bus.replug()
+        await asyncio.sleep(10)
+        assert entry.state is ConfigEntryState.LOADED
+        status = await get_entity(hass, "sensor", entry, "1_status")
+        assert state_of(hass, status) == "available"
+        assert port_waits() == 0
+        await hass.config_entries.async_unload(entry.entry_id)
+
+
+def port_waits() -> int:
+    return sum(
+        task.get_name().startswith("evse_bus port of ") for task in asyncio.all_tasks()
+    )
+
+
+@pytest.mark.parametrize("what", ["disable", "unload", "remove"])
+async def test_a_port_that_is_not_wanted_any_more_is_not_tried(
+    hass: HomeAssistant, what: str
+) -> None:
+    with VirtualBus.in_loop(AblBox(1)) as bus:
+        bus.unplug()
+        entry = await setup_bus(hass, "abl", bus.url, charger("abl", 1))
+        # Some of Home Assistant's own attempts are among these.
+        await asyncio.sleep(100)
+        assert port_waits() == 1
+        entries = hass.config_entries
+        if what == "disable":
+            await entries.async_set_disabled_by(
+                entry.entry_id, ConfigEntryDisabler.USER
+            )
+        elif what == "unload":
+            await entries.async_unload(entry.entry_id)
+        else:
+            await entries.async_remove(entry.entry_id)
+        bus.replug()
+        await asyncio.sleep(60)
+        assert port_waits() == 0
+        assert bus.opened == 0
 
 
 @pytest.mark.usefixtures("socket_enabled")

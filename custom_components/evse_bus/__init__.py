@@ -18,7 +18,7 @@ from homeassistant.helpers.device_registry import ChildDeviceEntry, DeviceEntry
 from homeassistant.helpers.typing import ConfigType
 
 from .configuration import protocol_of, rebuild_data
-from .connections import ListenerConnections
+from .connections import ListenerConnections, async_set_up_when_open
 from .const import DOMAIN
 from .coordinator import BusCoordinator, EvseBusConfigEntry
 from .discovery import (
@@ -70,6 +70,7 @@ async def async_setup_entry(hass: HomeAssistant, entry: EvseBusConfigEntry) -> b
         await hass.config_entries.async_forward_entry_setups(entry, PLATFORMS)
     except LineError as error:
         await coordinator.async_stop()
+        async_set_up_when_open(hass, entry, coordinator.connections)
         listens = coordinator.bus is None
         raise not_ready(error, coordinator.port, listens=listens) from error
     except BaseException:

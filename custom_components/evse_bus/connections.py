@@ -8,17 +8,24 @@ from abc import ABC, abstractmethod
 import asyncio
 from collections.abc import Callable, Iterable, Mapping
 from ipaddress import ip_network
-from typing import Any, override
+from typing import Any, Final, override
 
-from homeassistant.config_entries import ConfigEntry
+from homeassistant.config_entries import ConfigEntry, ConfigEntryState
 from homeassistant.const import CONF_DEVICE, CONF_HOST, CONF_PORT
+from homeassistant.core import HomeAssistant, callback
 
 from .configuration import line_settings, protocol_of, supply_of
 from .const import CONF_ALLOWED
 from .evse.bus import Bus
 from .evse.dialling import Network, UnknownBox
+from .evse.errors import LineError
+from .evse.line import Line
 from .evse.master import BusMaster
 from .evse.model import ChargerConfig
+from .evse.recovery import PAUSES
+
+SETUP_PAUSE: Final = PAUSES[-1]
+"""Pause before each attempt to open the port of a config entry that waits for it, s."""
 
 
 class Connections(ABC):
@@ -44,6 +51,13 @@ class Connections(ABC):
     @abstractmethod
     async def stop(self) -> None:
         """Stop all buses and close the port or listener."""
+
+    @abstractmethod
+    async def probe(self) -> None:
+        """Open the port or listener and close it again; raises LineError.
+
+        Only while it is not started. Nothing is sent.
+        """
 
     @abstractmethod
     async def acquire_bus(self, config: ChargerConfig, name: str) -> Bus:
@@ -87,6 +101,12 @@ class PortConnection(Connections):
     @override
     async def stop(self) -> None:
         await self._bus.stop()
+
+    @override
+    async def probe(self) -> None:
+        line = Line(self._bus.line.url, self._bus.line.settings)
+        await line.open()
+        await line.close()
 
     @override
     async def acquire_bus(self, config: ChargerConfig, name: str) -> Bus:
@@ -142,6 +162,11 @@ class ListenerConnections(Connections):
         await asyncio.gather(*(self._remove(serial) for serial in tuple(self._buses)))
 
     @override
+    async def probe(self) -> None:
+        await self.listener.start()
+        await self.listener.stop()
+
+    @override
     async def acquire_bus(self, config: ChargerConfig, name: str) -> Bus:
         serial = config.serial or ""
         bus = self._buses[serial] = self.listener.register(serial, name)
@@ -192,3 +217,37 @@ def connection_name(data: Mapping[str, Any]) -> str:
 def address_name(host: str, port: int) -> str:
     """Return ``host:port``, with brackets around an IPv6 address."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+@callback
+def async_set_up_when_open(
+    hass: HomeAssistant, entry: ConfigEntry, connections: Connections
+) -> None:
+    """Set up a config entry again as soon as its port can be opened.
+
+    To be called before ConfigEntryNotReady is raised. Home Assistant repeats the setup
+    by itself, but its pauses grow to 10 min, and a bus must be back within 10 s of its
+    adapter.
+    """
+
+    async def wait() -> None:
+        try:
+            while True:
+                await asyncio.sleep(SETUP_PAUSE)
+                try:
+                    await connections.probe()
+                except LineError:
+                    continue
+                hass.config_entries.async_schedule_reload(entry.entry_id)
+                return
+        finally:
+            forget()
+
+    @callback
+    def on_state_change() -> None:
+        # Unloaded, removed, or set up again by Home Assistant.
+        if entry.state is not ConfigEntryState.SETUP_RETRY:
+            task.cancel()
+
+    task = hass.async_create_background_task(wait(), f"evse_bus port of {entry.title}")
+    forget = entry.async_on_state_change(on_state_change)
