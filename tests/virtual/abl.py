@@ -23,7 +23,9 @@ if TYPE_CHECKING:
     from .car import Car
     from .wire import Segment
 
-WRITABLE = frozenset({0x05, 0x14, 0x2C})
+STATE = 0x05
+CONFIGURATION = 0x2C
+WRITABLE = frozenset({STATE, 0x14, CONFIGURATION})
 RESET = 0x5A5A
 LAST_ID = 16
 FIELD_ON, FIELD_OFF = 0b10, 0b01
@@ -31,13 +33,17 @@ FIELD_ON, FIELD_OFF = 0b10, 0b01
 
 @dataclass(frozen=True, slots=True)
 class Write:
-    """A write received by the box: its real time, its value, and its outcome."""
+    """A write received by the box: its real time, its value, and its outcome.
+
+    `plugged`: a car was plugged in, whatever the state showed of it.
+    """
 
     t: float
     register: int
     value: int
     accepted: bool
     broadcast: bool
+    plugged: bool = False
 
 
 class AblBox(Device):
@@ -52,6 +58,15 @@ class AblBox(Device):
     - `sleep_after` (s, None = never), `wake_time`, `wakes_on`: see the README
     - `lost_asleep_each`: requests lost in each sleep: one [trace], several [some say]
     - `stray`: bytes before the first reply after a sleep [code of two projects]
+
+    Setting a device-ID: one program does it, no trace shows it. No source settles:
+    - `id_applies`: a written ID counts after the "reset", or from the "write" on
+    - `id_confirmed_from`: the ID in the reply to a write that counts at once
+    - `id_kept_without_power`: a written ID waits for the power to come back
+    - `outside_e2`: a write of 0x2C outside E2 is "refused", or "ignored"
+    - `reset_answer`: "before" the reset, "after" it (from the ID it then has), "never"
+    - `boot_time`: how long it is deaf after a reset, s
+    - `reads_in_e2`: in E2 it answers reads
     """
 
     parity: ClassVar[str] = "E"
@@ -113,6 +128,13 @@ class AblBox(Device):
         self.answer_register: int | None = None
         self.unreadable_in_b2 = False
         self.l3_first = True
+        self.on = True
+        self.id_applies: Literal["reset", "write"] = "reset"
+        self.id_confirmed_from: Literal["old", "new"] = "old"
+        self.id_kept_without_power = True
+        self.outside_e2: Literal["refused", "ignored"] = "refused"
+        self.reset_answer: Literal["before", "after", "never"] = "before"
+        self.reads_in_e2 = True
         self.writes: list[Write] = []
         self.refused = 0
         self.ignored = 0
@@ -124,6 +146,7 @@ class AblBox(Device):
         self._still_lost = 0
         self._woken = False
         self._configuration = 0
+        self._id_before = 0
         self._contacted = False
 
     # For tests
@@ -154,8 +177,20 @@ class AblBox(Device):
 
     @on_bus_thread
     def power_cycle(self) -> None:
-        """Lose power for a moment: Icmax is Idefault again, a new ID takes effect."""
-        self._reset()
+        """Lose power for a moment: Icmax is Idefault again."""
+        self._power_up()
+
+    @on_bus_thread
+    def switch_off(self) -> None:
+        """Take the power away: it receives and sends nothing."""
+        self.on = False
+
+    @on_bus_thread
+    def switch_on(self) -> None:
+        """Give it power again."""
+        if not self.on:
+            self.on = True
+            self._power_up()
 
     @on_bus_thread
     def stop_locally(self) -> None:
@@ -193,6 +228,8 @@ class AblBox(Device):
             "writes": len(self.writes),
             "state": self.state,
             "ic_amps": round(self.ic_amps, 2),
+            "device_id": self.device_id,
+            "on": self.on,
         }
 
     # On the bus
@@ -208,7 +245,7 @@ class AblBox(Device):
 
     def receive(self, segment: Segment) -> None:
         """Receive bytes; reply to a request addressed to this box."""
-        if segment.end <= self._deaf_until:
+        if not self.on or segment.end <= self._deaf_until:
             return
         asleep = self.asleep
         if self.wakes_on == "any":
@@ -256,19 +293,46 @@ class AblBox(Device):
         value = request.value
         if value is None or request.register not in WRITABLE:
             return None
-        accepted = self._write(request.register, value)
-        broadcast = request.device_id == BROADCAST
+        return self._answer_write(request, value)
+
+    def _answer_write(self, request: Request, value: int) -> bytes | None:
+        register, own_id = request.register, request.device_id
+        car = self.outlet.car
+        plugged = car is not None and car.plugged
+        accepted = self._write(register, value)
+        broadcast = own_id == BROADCAST
         self.writes.append(
-            Write(request.t, request.register, value, accepted, broadcast)
+            Write(request.t, register, value, accepted, broadcast, plugged)
         )
         self.refused += not accepted
         self.step()
-        if broadcast:
+        ignored = register == CONFIGURATION and self.outside_e2 == "ignored"
+        if broadcast or (not accepted and ignored):
             return None
-        own_id = request.device_id
         if not accepted:
             return line(">", bytes((own_id, FAILURE, WRITE_FAILED)))
+        if (register, value) == (STATE, RESET):
+            return self._reset_answer(request)
+        if register == CONFIGURATION and self.id_confirmed_from == "new":
+            own_id = self.device_id
         return line(">", bytes((own_id, WRITE)) + request.data[:4])
+
+    def _reset_answer(self, request: Request) -> bytes | None:
+        """Return the reply to a reset, or None where it comes later or never."""
+        confirmation = bytes((WRITE,)) + request.data[:4]
+        if self.reset_answer == "before":
+            return line(">", bytes((request.device_id,)) + confirmation)
+        if self.reset_answer == "after" and self.bus is not None:
+            self.bus.loop.call_later(
+                self._answer_time + self.boot_time + self.turn_round,
+                self._send_late,
+                confirmation,
+            )
+        return None
+
+    def _send_late(self, confirmation: bytes) -> None:
+        if self.on:
+            self.send(line(">", bytes((self.device_id,)) + confirmation), 0.0)
 
     def _read(self, request: Request) -> bytes | None:
         blocks = dict(BLOCKS)
@@ -282,6 +346,8 @@ class AblBox(Device):
         broadcast = request.device_id == BROADCAST
         if broadcast and request.register not in BROADCAST_READS:
             return None
+        if self.outlet.state == "E2" and not self.reads_in_e2:
+            return None
         number = request.register
         if self.answer_register is not None:
             number = self.answer_register
@@ -291,17 +357,20 @@ class AblBox(Device):
     def _write(self, register: int, value: int) -> bool:
         if register == 0x14:
             return self.outlet.write_icmax(value, self.now())
-        if register == 0x2C:
+        if register == CONFIGURATION:
             return self._configure(value)
         return self._modify_state(value)
 
     def _configure(self, value: int) -> bool:
-        """Store a new ID and settings; they take effect after the next reset."""
+        """Store a new ID and settings; the settings take effect after a reset."""
         if self.outlet.state != "E2" or value & 0x0F00:
             return False
         if not 1 <= value & 0xFF <= LAST_ID:
             return False
         self._configuration = value
+        self._id_before = self._id_before or self.device_id
+        if self.id_applies == "write":
+            self.device_id = value & 0xFF
         return True
 
     def _modify_state(self, value: int) -> bool:
@@ -312,18 +381,21 @@ class AblBox(Device):
             return True
         return self.outlet.execute(value)
 
+    @property
+    def _answer_time(self) -> float:
+        """Return the time after which the reply to a request is over, s."""
+        byte_time = self.bus.byte_time if self.bus is not None else 0.0
+        return self.turn_round + self.jitter + 20 * byte_time
+
     def _schedule_reset(self) -> None:
-        if self.bus is None:
-            return
-        answer_time = self.turn_round + self.jitter + 20 * self.bus.byte_time
-        self.bus.loop.call_later(answer_time, self._reset)
+        if self.bus is not None:
+            self.bus.loop.call_later(self._answer_time, self._reset)
 
     def _reset(self) -> None:
-        self.resets += 1
-        if self.bus is None:
+        if not self.on:
             return
-        configuration, self._configuration = self._configuration, 0
-        if configuration:
+        self.resets += 1
+        if configuration := self._configuration:
             self.device_id = configuration & 0xFF
             upstream = configuration >> 14
             if upstream in (FIELD_ON, FIELD_OFF):
@@ -331,6 +403,20 @@ class AblBox(Device):
             enable = configuration >> 12 & 0b11
             if enable in (FIELD_ON, FIELD_OFF):
                 self.outlet.b2_needs_enable_after_power = enable == FIELD_ON
+        self._boot()
+
+    def _power_up(self) -> None:
+        if self._configuration and self.id_kept_without_power:
+            self._reset()
+        else:
+            self.resets += 1
+            self.device_id = self._id_before or self.device_id
+            self._boot()
+
+    def _boot(self) -> None:
+        self._configuration = self._id_before = 0
+        if self.bus is None:
+            return
         self._finder = LineFinder()
         self._deaf_until = self.bus.time() + self.boot_time
         self.outlet.restart(self.now())

@@ -136,7 +136,10 @@ def _abl(options: argparse.Namespace) -> list[Device]:
             extra_registers=options.extra_registers,
             tells_icmax=not options.no_icmax,
             turn_round=options.turn_round,
+            boot_time=options.boot_time,
         )
+        box.id_applies = "write" if options.id_at_once else "reset"
+        box.reset_answer = options.reset_answer
         box.l3_first = not options.l1_first
         box.outlet.default_duty = options.default_duty
         box.outlet.idle_floor = options.idle_floor
@@ -253,6 +256,16 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--lost-asleep", type=int, default=1, metavar="N", help="requests lost asleep")
     add("--turn-round", type=float, default=0.002, metavar="S")
+    add("--boot-time", type=float, default=0.3, metavar="S", help="deaf after a reset")
+    add(
+        "--id-at-once", action="store_true", help="a new ID counts before the reset too"
+    )
+    add(
+        "--reset-answer",
+        choices=["before", "after", "never"],
+        default="before",
+        help="when a reset is confirmed",
+    )
     add("--l1-first", action="store_true", help="L1 in the first word, not the third")
     evbox = kinds.add_parser("evbox", help="EVBox ChargePoints (Protocol Max v4)")
     _common(evbox.add_argument)

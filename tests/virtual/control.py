@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 HELP = (
     "plug|request|finish|leave ID[.MODULE]; dead|alive|power-cycle ID;"
+    " off|on ID (of an ABL box; its serial number too, where two have one ID);"
     " fail ID N; clear ID; stop|start ID; others ID A;"
     " press ID; menu ID SETTING N; temperature ID C;"
     f" unplug-adapter; replug-adapter; advance S; status; {ews_cli.HELP}"
@@ -78,9 +79,15 @@ class Control:
             device.power_cycle()
         elif isinstance(device, SmartEvse):
             self._smartevse_command(word, device, values)
-        elif not isinstance(device, AblBox):
+        elif isinstance(device, AblBox):
+            self._abl_command(word, device, values)
+        else:
             msg = f"{device.name} has no command {word}"
             raise TypeError(msg)
+
+    def _abl_command(self, word: str, device: AblBox, values: list[str]) -> None:
+        if word in ("off", "on"):
+            (device.switch_off if word == "off" else device.switch_on)()
         elif word == "fail":
             device.fail(int(values[0]))
         elif word == "clear":
@@ -112,6 +119,9 @@ class Control:
 
     def _device(self, key: str) -> Device:
         key = key.partition(".")[0]
+        for device in self._bus.devices:
+            if isinstance(device, AblBox) and key == device.serial:
+                return device
         for device in self._bus.devices:
             if isinstance(device, AblBox) and device.device_id == int(key):
                 return device
@@ -155,8 +165,10 @@ def describe(bus: VirtualBus) -> str:
             lines.append(f"  {device.name}{dead}: {ews_cli.describe_box(device)}")
         elif isinstance(device, AblBox):
             currents = "/".join(f"{c:.1f}" for c in device.outlet.phase_currents)
+            off = "" if device.on else " (off)"
             lines.append(
-                f"  {device.name}{dead}: {device.state}, may {device.ic_amps:.1f} A,"
+                f"  {device.name}{dead}{off}: ID {device.device_id},"
+                f" {device.serial}, {device.state}, may {device.ic_amps:.1f} A,"
                 f" draws {currents} A, {device.requests} requests"
             )
         elif isinstance(device, EvboxChargePoint):

@@ -13,6 +13,7 @@ from .abl import AblBox
 from .abl_frames import duty_of, line, requests_in
 from .bus import VirtualBus
 from .car import Car
+from .control import Control
 
 READ_FULL = b":0103002E0005C9\r\n"
 SET_10_A = b":0110001400010200A632\r\n"
@@ -245,6 +246,107 @@ def test_a_new_device_id_takes_effect_after_the_reset() -> None:
         assert int(answer[13:15], 16) & 0x40, "upstream time-out switched on"
         assert box.outlet.b2_needs_enable_after_power
         assert client.ask(READ_FULL, timeout=SILENT) == b""
+
+
+def set_up(client: PortClient, value: int = 0xF005) -> bytes:
+    """Go to E2 and write a device-ID; return the reply to that."""
+    client.ask(write(0x05, 0xE2E2))
+    return client.ask(write(0x2C, value))
+
+
+def test_a_device_id_may_count_from_its_write_on() -> None:
+    box = AblBox(1, boot_time=0.01)
+    box.id_applies = "write"
+    with line_to(box) as (bus, client):
+        assert set_up(client).startswith(b">0110002C")
+        assert client.ask(READ_FULL, timeout=SILENT) == b""
+        assert state(client.ask(read(0x2E, 5, box=5))) == b"E2"
+        box.id_confirmed_from = "new"
+        assert client.ask(write(0x2C, 0xF006, box=5)).startswith(b">0610002C")
+        # Not stored before the reset: whether it outlives the power is not known.
+        box.id_kept_without_power = False
+        box.power_cycle()
+        assert box.device_id == 1
+        bus.wait_for(lambda: bus.time() > box._deaf_until)
+        set_up(client)
+        box.id_kept_without_power = True
+        box.power_cycle()
+        assert box.device_id == 5
+
+
+def test_a_device_id_before_the_reset_and_the_power() -> None:
+    for kept, device_id in ((True, 5), (False, 1)):
+        box = AblBox(1)
+        box.id_kept_without_power = kept
+        with line_to(box) as (_, client):
+            set_up(client)
+            box.power_cycle()
+            assert (box.device_id, box.state) == (device_id, "A1")
+
+
+def test_a_write_of_a_device_id_outside_e2_may_be_ignored() -> None:
+    box = AblBox(1)
+    box.outside_e2 = "ignored"
+    with line_to(box) as (_, client):
+        assert client.ask(write(0x2C, 0xF005), timeout=SILENT) == b""
+        assert box.refused == 1
+
+
+def test_the_reply_to_a_reset() -> None:
+    reset = write(0x05, 0x5A5A)
+    box = AblBox(1, boot_time=0.2)
+    with line_to(box) as (bus, client):
+        box.reset_answer = "never"
+        assert client.ask(reset, timeout=0.3) == b""
+        assert box.resets == 1
+        set_up(client)
+        box.reset_answer = "after"
+        # It has its new ID by then.
+        assert client.ask(reset, timeout=0.3).startswith(b">05100005")
+        assert bus.time() > box._deaf_until
+
+
+def test_reads_in_e2_may_stay_unanswered() -> None:
+    box = AblBox(1)
+    box.reads_in_e2 = False
+    with line_to(box) as (_, client):
+        client.ask(write(0x05, 0xE2E2))
+        assert client.ask(READ_FULL, timeout=SILENT) == b""
+        assert client.ask(write(0x05, 0xA1A1)).startswith(b">01100005")
+        assert state(client.ask(READ_FULL)) == b"A1"
+
+
+def test_a_box_that_is_switched_off() -> None:
+    twins = [AblBox(1, serial=f"2W22xy0000000{n}", boot_time=0.01) for n in (1, 2)]
+    serial = read(0x50, 8)
+    with line_to(*twins) as (bus, client):
+        client.ask(SET_10_A)
+        assert [round(box.ic_amps) for box in twins] == [10, 10]
+        assert bus.wire.collisions
+        replies: list[str] = []
+        control = Control(bus, replies.append)
+        control.do("off 2W22xy00000002")
+        assert twins[0].serial.encode().hex().upper().encode() in client.ask(serial)
+        control.do("on 2W22xy00000002")
+        assert replies == ["ok", "ok"]
+        bus.wait_for(lambda: bus.time() > twins[1]._deaf_until)
+        # It has forgotten its limit.
+        assert [round(box.ic_amps) for box in twins] == [10, 16]
+
+
+def test_a_write_notes_whether_a_car_is_plugged_in() -> None:
+    car = Car()
+    box = AblBox(1, car=car)
+    with line_to(box) as (_, client):
+        client.ask(write(0x05, 0xE0E0))
+        car.plug_in()
+        client.ask(write(0x05, 0xE2E2))
+        assert [(one.value, one.plugged) for one in box.writes] == [
+            (0xE0E0, False),
+            (0xE2E2, True),
+        ]
+        # The bit of the pilot is not valid there.
+        assert not int(client.ask(READ_FULL)[11:15], 16) & 0x8000
 
 
 def test_icmax_is_lost_with_the_power() -> None:
