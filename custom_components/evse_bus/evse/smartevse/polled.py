@@ -10,11 +10,16 @@ A later box needs quiet: any request on the line, to any address, suspends its o
 cycle for 4 s; without that cycle no new current takes effect, and after 10 s it stops
 with NO_COMM. So all exchanges that are due go in one burst, followed by quiet time.
 Only a pause does not wait for its end. PROTOCOLS.md, 3.
+
+Several conversations may wait for the end of one quiet time (orders, and the override
+of a box just found). They go in one burst, and what one of them has written is not
+written again by the next: each write would put off the read-back of all.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
+from math import inf
 from typing import ClassVar, Final, override
 
 from ..conversation import FollowUp, rest
@@ -38,6 +43,7 @@ from ..model import (
     Range,
     Setting,
 )
+from ..registers import Block
 from ..safety import Setpoint, clamp
 from ..schedule import Kind
 from .charger import SmartEvseCharger
@@ -50,6 +56,8 @@ from .states import CHARGING, is_stopped, offered, shows_plug, state_of
 
 QUIET: Final = 6.5
 """Time without any request on the line that a later box needs, s."""
+BURST: Final = 1.0
+"""Time from the first request of a burst in which another turn may join it, s."""
 COMMANDS_FIRST: Final = 0.05
 """Pause between the end of the quiet time and a poll, s."""
 SETTLING: Final = 3.0
@@ -73,12 +81,16 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
         """Begin with an unknown box."""
         super().__init__(config, orders)
         self._needs_quiet = False
-        self._last_request = 0.0
+        self._last_request = -inf
         """Loop time of the last request on the line."""
-        self._read_at = 0.0
-        """Loop time of the last status."""
+        self._burst_until = -inf
+        """Loop time until which a turn may join the burst that has begun."""
         self._written: int | None = None
         """The override that we wrote last, 0.1 A; ``None``: not known to be there."""
+        self._written_at = -inf
+        """Loop time of the last write of an override."""
+        self._read_back = True
+        """The status was read since, when the override had had time to take effect."""
         self._confirmed: int | None = None
         """The set-point within which it was read back to charge, 0.1 A."""
         self._fell_back = False
@@ -99,20 +111,25 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
 
     @override
     def minimum_pause(self, now: float) -> float:
+        return 0.0 if now < self._burst_until else self._rest_of_quiet(now)
+
+    def _rest_of_quiet(self, now: float) -> float:
+        """Return the time until the box has had its quiet, s."""
         if self.dialect is not None:
             self._needs_quiet = self.dialect is Dialect.LATER
         if not self._needs_quiet:
             return 0.0
         # Any request counts, to any address and from any of our chargers.
         sent_at = self.bus.wire.sent_at if self.bus is not None else None
-        self._last_request = max(self._last_request, sent_at or 0.0)
+        if sent_at is not None:
+            self._last_request = max(self._last_request, sent_at)
         return max(0.0, self._last_request + QUIET - now)
 
     @override
     def plan(self, now: float) -> None:
         super().plan(now)
         # A little after the quiet: a command that waited for its end goes first.
-        quiet = now + self.minimum_pause(now) + COMMANDS_FIRST
+        quiet = now + self._rest_of_quiet(now) + COMMANDS_FIRST
         if self._needs_quiet:
             self.slot.ready = self.slot.due = max(self.slot.ready, quiet)
 
@@ -122,6 +139,25 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
             message = f"{self.config.name} must be left alone: its quiet was disturbed"
             raise LineBusyError(message)
         return await super().poll(turn)
+
+    @override
+    async def read(self, turn: Turn, block: Block) -> bytes:
+        self._begin_burst(turn.now)
+        return await super().read(turn, block)
+
+    def _begin_burst(self, now: float) -> None:
+        """Begin a burst with the request about to be sent, unless one has begun."""
+        if self._rest_of_quiet(now) <= 0:
+            self._burst_until = now + BURST
+
+    @override
+    async def read_status_once(self, turn: Turn) -> None:
+        asked_at = turn.now
+        rested = self._rest_of_quiet(asked_at) <= 0
+        await super().read_status_once(turn)
+        settling = 0.0 if self._needs_quiet else SETTLING
+        if rested and asked_at >= self._written_at + settling:
+            self._read_back = True
 
     # -- State ---------------------------------------------------------------------
 
@@ -172,7 +208,6 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
             # Only a restart forgets the cable.
             self._written = None
         super().on_status(status, now)
-        self._read_at = now
         charging = status.raw_state in CHARGING
         within = charging and not self._is_above(status)
         setpoint = tenths(self.setpoint)
@@ -204,6 +239,7 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
     @override
     async def write(self, turn: Turn, request: Request, register: int) -> bool | None:
         self._check_alone()
+        self._begin_burst(turn.now)
         return await super().write(turn, request, register)
 
     def _check_alone(self) -> None:
@@ -241,7 +277,7 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
         # The settings just read may have lowered the set-point.
         await self._stop_if_necessary(turn)
         if self._must_write():
-            await self._follow(turn, lambda: self.setpoint)
+            await self._follow(turn, lambda: self.setpoint, is_standing=True)
         if self._may_start(_NO_CHANGE):
             # No order took its current away: installation limit, settings or lifetime.
             await self._enable(turn, _NO_CHANGE)
@@ -277,11 +313,17 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
         if status is None:
             return False
         target = self._override_for(status, self.setpoint)
-        if target is None:
+        return target is not None and not self._stands(status, target)
+
+    def _stands(self, status: Status, target: Setpoint) -> bool:
+        """Return whether an override was written and may be in force: no second write.
+
+        A car that charges with more disproves it, once it has had time to take effect.
+        """
+        if self._written != tenths(target):
             return False
-        if status.raw_state in CHARGING and self._is_above(status, target):
-            return True
-        return self._written != tenths(target)
+        charging = status.raw_state in CHARGING
+        return not (charging and self._read_back and self._is_above(status, target))
 
     def _override_for(self, status: Status, setpoint: Setpoint) -> Setpoint | None:
         """Return the override for a status; ``None``: no current is allowed.
@@ -301,8 +343,17 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
 
     # -- The current ---------------------------------------------------------------
 
-    async def _follow(self, turn: Turn, wanted: Callable[[], Setpoint]) -> None:
-        """Write the override; while a car charges, read it back.
+    async def _follow(
+        self,
+        turn: Turn,
+        wanted: Callable[[], Setpoint],
+        *,
+        is_standing: bool = False,
+    ) -> None:
+        """Write the override, unless it stands; while a car charges, read it back.
+
+        ``is_standing``: the set-point is that of the orders that stand; one that is
+        under way takes precedence.
 
         A box that goes on offering more is stopped: a limit must hold. Raises
         NotConfirmedError then.
@@ -313,15 +364,13 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
             status = self.status
             if status is None:
                 continue
-            if self._fell_back:
-                self.statistics.reasserted += 1
-                self._fell_back = False
-            sent = await self._write_current(turn, status, wanted)
+            sent = await self._write_unless_it_stands(turn, status, wanted)
             if status.raw_state not in CHARGING:
                 return
-            if self.known_dialect is not Dialect.LATER:
-                await rest(READ_AGAIN)
             await self._settle(turn, wanted)
+            if is_standing and self._written not in (None, sent):
+                # An order has been written meanwhile; it is confirmed or taken back.
+                return
             status = self.status
             setpoint = wanted()
             if (
@@ -333,6 +382,19 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
                 return
             await rest()
         await self._stop_excess(turn, is_current=sent == tenths(wanted()))
+
+    async def _write_unless_it_stands(
+        self, turn: Turn, status: Status, wanted: Callable[[], Setpoint]
+    ) -> int | None:
+        """Return the override that is to be read back, 0.1 A."""
+        target = self._override_for(status, wanted())
+        if target is not None and self._stands(status, target):
+            # Another conversation has written it.
+            return self._written
+        if self._fell_back:
+            self.statistics.reasserted += 1
+            self._fell_back = False
+        return await self._write_current(turn, status, wanted)
 
     async def _stop_excess(self, turn: Turn, *, is_current: bool) -> None:
         """Stop a box that does not follow; ``is_current``: the limit has not changed.
@@ -374,29 +436,28 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
 
         answer = await self.write(turn, request, MAPS[dialect].current_register)
         self._written = None if answer is None else sent[-1]
+        self._written_at = turn.now
+        self._read_back = False
         return sent[-1]
 
     async def _settle(self, turn: Turn, wanted: Callable[[], Setpoint]) -> None:
-        """Read the status until the box follows, or has had the time to."""
-        if self.known_dialect is Dialect.LATER:
-            # An earlier read would keep it from following; a poll may come first.
-            written_at = turn.now
-            while self._read_at < written_at:
-                while (pause := self.minimum_pause(turn.now)) > 0:
-                    await rest(pause)
-                if self._read_at < written_at:
-                    await self.read_status(turn)
-            return
-        until = turn.now + SETTLING
-        while True:
+        """Read the status until the box follows, or has had the time to.
+
+        A poll or another conversation may come first: one reading is for all.
+        """
+        if self.known_dialect is not Dialect.LATER and not self._read_back:
+            await rest(READ_AGAIN)
+        while not self._read_back:
+            if (pause := self._rest_of_quiet(turn.now)) > 0:
+                await rest(pause)
+                continue
             await self.read_status(turn)
             status = self.status
-            if (
-                turn.now >= until
-                or status is None
-                or status.raw_state not in CHARGING
-                or offered(self.known_dialect, status) == wanted().current
-            ):
+            if status is None or status.raw_state not in CHARGING:
+                return
+            if self.known_dialect is Dialect.LATER:
+                continue
+            if offered(self.known_dialect, status) == wanted().current:
                 return
             await rest(READ_AGAIN)
 
