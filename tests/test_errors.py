@@ -11,6 +11,7 @@ from custom_components.evse_bus.errors import not_ready, translated_errors
 from custom_components.evse_bus.evse import errors as library
 from tests.common import setup_bus
 from tests.flow import english
+from tests.reasons import reason_keys
 from tests.virtual import AblBox, VirtualBus
 
 
@@ -57,6 +58,20 @@ def test_the_chargers_own_reason_is_kept() -> None:
     with pytest.raises(HomeAssistantError) as said, translated_errors("Garage", "p"):
         raise library.ExchangeRefusedError("exception code 3", 3)
     assert said.value.translation_placeholders["error"] == "exception code 3"
+
+
+def test_a_command_that_cannot_act_now_has_a_translated_reason() -> None:
+    keys = reason_keys()
+    assert {"abl_outlet_disabled", "ews_start_state", "smartevse_mode_normal"} <= keys
+    texts = english()["exceptions"]
+    details = {"state": "B2", "minimum": "16", "maximum": "13"}
+    for key in keys:
+        error = library.NotAvailableError("not now", key, **details)
+        with pytest.raises(HomeAssistantError) as said, translated_errors("Garage", ""):
+            raise error
+        assert said.value.translation_key == key
+        shown = texts[key]["message"].format(**said.value.translation_placeholders)
+        assert "Garage" in shown
 
 
 def test_ports_differ() -> None:

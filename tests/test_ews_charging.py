@@ -237,6 +237,9 @@ async def test_ended_at_the_box_stays_ended(hass: HomeAssistant) -> None:
         await polled(bus, box, 10)
         assert orders(box) == [START]
         assert box.ports[0].status == 0x50
+        assert state_of(hass, switch) == "on"
+        reason = await get_entity(hass, "sensor", entry, "1_pause_reason")
+        assert state_of(hass, reason) == "charge_ended"
 
 
 async def test_ports_are_paused_each_for_itself(hass: HomeAssistant) -> None:
@@ -302,7 +305,7 @@ async def test_a_household_socket_on_a_small_fuse_never_charges(
         await plug_in(bus, box, 2)
         with pytest.raises(HomeAssistantError, match="needs 16 A") as refused:
             await call(hass, "switch.turn_on", switch)
-        assert refused.value.translation_key == "not_available"
+        assert refused.value.translation_key == "ews_maximum_too_low"
         await polled(bus, box, 20)
         assert state_of(hass, switch) == "off"
         assert START not in orders(box, 2)

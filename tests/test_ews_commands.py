@@ -102,7 +102,7 @@ async def test_locking_an_empty_socket_is_refused(hass: HomeAssistant) -> None:
         lock = await get_entity(hass, "switch", entry, "2_cable_lock")
         with pytest.raises(HomeAssistantError) as refused:
             await call(hass, "switch.turn_on", lock)
-        assert refused.value.translation_key == "not_available"
+        assert refused.value.translation_key == "ews_lock_state"
         assert "0x00" in str(refused.value)
         assert not orders(box, 2)
         assert state_of(hass, lock) == "off"
@@ -189,7 +189,7 @@ async def test_request_a_start(hass: HomeAssistant) -> None:
         asked = await get_entity(hass, "binary_sensor", entry, "1_start_requested")
         with pytest.raises(HomeAssistantError) as refused:
             await call(hass, "button.press", button)
-        assert refused.value.translation_key == "not_available"
+        assert refused.value.translation_key == "ews_request_start_state"
         assert not orders(box)
         await plug_in(bus, box)
         await polled(bus, box)

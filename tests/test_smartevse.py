@@ -186,7 +186,7 @@ async def test_a_mode_that_cannot_be_changed_says_why(hass: HomeAssistant) -> No
         mode = await get_entity(hass, "select", entry, "mode")
         with pytest.raises(HomeAssistantError) as refused:
             await call(hass, "select.select_option", mode, option="solar")
-        assert refused.value.translation_key == "not_available"
+        assert refused.value.translation_key == "smartevse_mode_load_balancing"
         assert "Master in its menu" in str(refused.value)
         assert state_of(hass, mode) == "smart"
 

@@ -81,7 +81,9 @@ async def test_the_outlet_of_an_abl_box(hass: HomeAssistant) -> None:
         allowed = await get_entity(hass, "switch", entry, "charging_allowed")
         with pytest.raises(HomeAssistantError) as refused:
             await call(hass, "switch.turn_on", allowed)
-        assert refused.value.translation_key == "not_available"
+        assert refused.value.translation_key == "abl_outlet_disabled"
+        reason = await get_entity(hass, "sensor", entry, "pause_reason")
+        assert state_of(hass, reason) == "outlet_disabled"
         assert "outlet" in str(refused.value)
         await call(hass, "switch.turn_on", outlet)
         assert box.state == "A1"

@@ -41,6 +41,7 @@ from custom_components.evse_bus.issues import (
     WRONG_CHARGER,
 )
 from tests.flow import english
+from tests.reasons import reason_keys
 
 HERE = Path(__file__).parents[1] / "custom_components/evse_bus"
 
@@ -115,7 +116,7 @@ def test_errors_have_texts() -> None:
     texts = english()["exceptions"]
     keys = {key for _, key in (*_PORT_KEYS, *_LISTEN_KEYS, *_COMMAND_KEYS)}
     own = {f"ews_{reason}" for reason in Refusal} | {HiddenSecretError.text_key}
-    assert keys | own | set(ActionError) | {NOT_STORED} == texts.keys()
+    assert keys | own | reason_keys() | set(ActionError) | {NOT_STORED} == texts.keys()
     placeholders = dict.fromkeys(("charger", "port", "error", "expected", "found"), "x")
     for key in keys:
         assert texts[key]["message"].format(**placeholders)

@@ -216,8 +216,8 @@ class Bus(Observable):
         if not self.connected:
             message = f"{self.name} is not connected"
             raise LineLostError(message)
-        if self.master is not None and self.master.refusal is not None:
-            raise NotAvailableError(self.master.refusal)
+        if self.master is not None and (refusal := self.master.refusal) is not None:
+            raise refusal
         if (waiting := self._jobs.merge(job)) is not None:
             self.wire.statistics.merged += 1
             job = waiting

@@ -44,6 +44,7 @@ from .model import (
     Persistence,
     Range,
     Setting,
+    Status,
 )
 from .readings import ChargerInfo, ChargerReading
 from .safety import (
@@ -174,14 +175,32 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
 
     @property
     def pause_reason(self) -> PauseReason | None:
-        """Return why no car is charged now; ``None``: its orders let one charge."""
+        """Return why no car can charge now; ``None``: nothing known prevents it.
+
+        The orders come first; then the state, in which "allow" starts nothing.
+        """
         allowed = self.reading.allowed if self.reading is not None else None
         if allowed is False and not self.waits_for_current:
             return PauseReason.NOT_ALLOWED
         inputs = (self.effective_orders, self.limits)
         if self._reason is None or self._reason[0] != inputs:
             self._reason = (inputs, pause_reason(*inputs))
-        return self._reason[1]
+        return self._reason[1] or self.hindrance
+
+    @property
+    def hindrance(self) -> PauseReason | None:
+        """Return what in its state keeps a car from charging, whatever is ordered."""
+        reading = self.reading
+        if reading is None:
+            return None
+        if reading.outlet_enabled is False:
+            return PauseReason.OUTLET_DISABLED
+        statuses = {one.status for one in reading.connectors.values()}
+        if statuses == {Status.FAULTED}:
+            return PauseReason.FAULTED
+        if statuses == {Status.OUT_OF_SERVICE}:
+            return PauseReason.OUT_OF_SERVICE
+        return None
 
     @property
     def order_state(self) -> OrderState | None:

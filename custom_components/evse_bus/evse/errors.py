@@ -113,3 +113,16 @@ class RefusedOrderError(EvseError, ValueError):
 
 class NotAvailableError(EvseError):
     """The charger does not answer, or is not in a state for this command."""
+
+    def __init__(
+        self, message: str, text_key: str | None = None, **details: str
+    ) -> None:
+        """Keep the reason: the key of a translated message, and the values in it."""
+        super().__init__(message)
+        self.text_key = text_key
+        self._details = details
+
+    @property
+    @override
+    def details(self) -> dict[str, str]:
+        return self._details

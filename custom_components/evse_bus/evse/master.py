@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 
 from .charger import Charger, Scheduler
+from .errors import NotAvailableError
 from .exchange import Turn
 from .framing import Frame
 from .listeners import Observable
@@ -48,7 +49,7 @@ class BusMaster(ChargerGroup, Observable, ABC):
 
     @property
     @abstractmethod
-    def refusal(self) -> str | None:
+    def refusal(self) -> NotAvailableError | None:
         """Return why no command is accepted now; ``None``: commands are accepted."""
 
     @property

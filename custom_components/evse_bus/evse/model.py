@@ -102,7 +102,7 @@ class SessionResult(StrEnum):
 
 
 class PauseReason(StrEnum):
-    """Why no car is charged, as far as it is our doing or the user's."""
+    """Why no car can charge: the orders first, then the state of the charger."""
 
     NOT_ALLOWED = "not_allowed"
     """The user has switched charging off, here or at the charger."""
@@ -114,6 +114,14 @@ class PauseReason(StrEnum):
     """Its part of the shared supply is below the minimum."""
     LIMIT_NOT_FOLLOWED = "limit_not_followed"
     """It was stopped because it offered more than its limit."""
+    CHARGE_ENDED = "charge_ended"
+    """The charge has ended, and no command starts it again: plug in anew."""
+    OUTLET_DISABLED = "outlet_disabled"
+    """The outlet is switched off, here or at the charger."""
+    OUT_OF_SERVICE = "out_of_service"
+    """The charger starts, is set up, or is blocked."""
+    FAULTED = "faulted"
+    """The charger reports a fault that keeps it from charging."""
 
 
 class OrderState(StrEnum):

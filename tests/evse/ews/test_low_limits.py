@@ -100,6 +100,34 @@ def test_a_withheld_start_is_for_the_car_that_waits(how: str) -> None:
     play(EwsScene(), acts)
 
 
+@pytest.mark.parametrize("again", [False, True])
+def test_a_start_that_was_allowed_while_the_box_starts(again: bool) -> None:  # noqa: FBT001
+    """The car that waits then is started, unless the box starts once more."""
+
+    async def acts(scene: EwsScene) -> None:
+        charger = scene.charger()
+        await charger.change_orders(amperes(0.0))
+        await scene.plug()
+        scene.box.initialise()
+        await charger.change_orders(ON)
+        assert scene.status() == 0xF0
+        assert charger.pause_reason is PauseReason.LIMIT_TOO_LOW
+        await scene.until(lambda: scene.status() == 0x30)
+        await asyncio.sleep(5)
+        if again:
+            scene.box.initialise()
+            await asyncio.sleep(3)
+            await scene.until(lambda: scene.status() == 0x30)
+            await asyncio.sleep(5)
+        assert charger.waits_for_current != again
+        assert not scene.line.orders()
+        await charger.change_orders(amperes(9.0))
+        await asyncio.sleep(20)
+        assert (scene.status() == 0x40) != again
+
+    play(EwsScene(options={"init_time": 30.0}), acts)
+
+
 def test_an_old_permission_starts_no_car_that_comes_later() -> None:
     """Allowed before there was a car, at 0 A: it is not asked for this one."""
 

@@ -14,7 +14,12 @@ from custom_components.evse_bus.evse.events import (
     StartRequested,
 )
 from custom_components.evse_bus.evse.ews.wire.states import STATES
-from custom_components.evse_bus.evse.model import OrderChange, SessionResult, Status
+from custom_components.evse_bus.evse.model import (
+    OrderChange,
+    PauseReason,
+    SessionResult,
+    Status,
+)
 
 from .scene import EwsScene, now, play
 
@@ -137,6 +142,11 @@ def test_a_stop_at_the_box_is_not_ended_by_us() -> None:
         await scene.charger().change_orders(ON)
         await scene.charger().change_orders(amperes(20.0))
         assert not scene.line.orders(since=begin)
+        assert scene.charger().pause_reason is PauseReason.CHARGE_ENDED
+        scene.cars[0].leave()
+        await scene.until(lambda: scene.status() == 0x00)
+        await asyncio.sleep(5)
+        assert scene.charger().pause_reason is None
 
     play(EwsScene(), acts)
 

@@ -30,7 +30,7 @@ from .duty import PAUSE
 from .reader import ICMAX_PROBES, AblReader
 from .registers import Reading, StateCode, limit_duty
 from .states import E0, E2, SETUP, is_failure
-from .steps import reach_state, restore
+from .steps import reach_state, refuse_in, restore
 
 GARBLED_REPLIES: Final = 3
 """Unreadable replies in a row that suggest two boxes with one device-ID."""
@@ -218,15 +218,12 @@ class AblCharger(AblReader):
     def _require_startable(self, status: Reading) -> None:
         """Raise NotAvailableError in a state in which charging cannot be allowed."""
         if status.state in SETUP:
-            reason = "is in set-up mode"
-        elif is_failure(status.state):
-            reason = "reports a failure"
-        elif status.state == E0:
-            reason = "has its outlet disabled, enable it first"
-        else:
-            return
-        message = f"{self.config.name} {reason}"
-        raise NotAvailableError(message)
+            raise refuse_in(self, status, "abl_setup_mode", "set-up mode")
+        if is_failure(status.state):
+            raise refuse_in(self, status, "abl_failure", "a failure")
+        if status.state == E0:
+            why = "the outlet is disabled, enable it first"
+            raise refuse_in(self, status, "abl_outlet_disabled", why)
 
     def _may_write(
         self, status: Reading, now: float, orders: Orders, change: OrderChange
@@ -238,8 +235,7 @@ class AblCharger(AblReader):
         mode.
         """
         if status.state in SETUP:
-            message = f"{self.config.name} is in set-up mode"
-            raise NotAvailableError(message)
+            raise refuse_in(self, status, "abl_setup_mode", "set-up mode")
         if is_failure(status.state):
             # Sent when the failure is over.
             self.raise_pending = True

@@ -66,7 +66,9 @@ async def _enable_outlet(reader: AblReader, turn: Turn) -> None:
     status = await reach(reader, turn)
     if state_of(status.state).outlet_enabled is not True:
         if status.state not in (E0, E2):
-            raise refuse_in(reader, status, "an outlet is enabled in E0 or E2")
+            raise refuse_in(
+                reader, status, "abl_enable_state", "an outlet is enabled in E0 or E2"
+            )
         was_allowed = reader.paused is False
         await lower_limit(reader, turn, status)
         status = await reach_state(
@@ -84,9 +86,11 @@ async def _enable_outlet(reader: AblReader, turn: Turn) -> None:
 async def _wake(reader: AblReader, turn: Turn) -> None:
     status = await reach(reader, turn)
     if status.state != B2:
-        raise refuse_in(reader, status, "only a car that may charge can be woken")
+        why = "only a car that may charge can be woken"
+        raise refuse_in(reader, status, "abl_wake_state", why)
     if reader.paused or reader.setpoint.paused:
-        raise refuse_in(reader, status, "charging is paused, waking would not help")
+        why = "charging is paused, waking would not help"
+        raise refuse_in(reader, status, "abl_wake_paused", why)
     reader.pending_cleanup = Cleanup(StateCode.A1, E0)
     try:
         confirmed = await reader.set_state(turn, StateCode.E0)

@@ -87,13 +87,14 @@ def _check_ready(reader: AblReader, status: Reading) -> str:
     Raises NotAvailableError.
     """
     if status.state not in (A1, E0):
-        raise refuse_in(reader, status, "settings are changed in A1 or E0")
+        why = "settings are changed in A1 or E0"
+        raise refuse_in(reader, status, "abl_settings_state", why)
     if reader.serial is None:
         message = (
             f"{reader.config.name} has no serial number: it cannot be distinguished "
             "from another box with the same device-ID"
         )
-        raise NotAvailableError(message)
+        raise NotAvailableError(message, "abl_no_serial")
     return reader.serial
 
 

@@ -56,10 +56,13 @@ async def rest_without_polls(reader: AblReader, turn: Turn, pause: float) -> Non
     hold_polls(reader, turn)
 
 
-def refuse_in(reader: AblReader, status: Reading, reason: str) -> NotAvailableError:
+def refuse_in(
+    reader: AblReader, status: Reading, text_key: str, why: str
+) -> NotAvailableError:
     """Return the error for a command that is not possible in a state."""
     state = state_of(status.state).name
-    return NotAvailableError(f"{reader.config.name} is in state {state}: {reason}")
+    message = f"{reader.config.name} is in state {state}: {why}"
+    return NotAvailableError(message, text_key, state=state)
 
 
 async def reach_state(

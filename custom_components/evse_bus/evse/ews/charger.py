@@ -153,7 +153,12 @@ class EwsPort(EwsReader):
                 f"{self.config.name} needs {limits.minimum:g} A, "
                 f"and no more than {limits.ceiling:g} A may be offered"
             )
-            raise NotAvailableError(message)
+            raise NotAvailableError(
+                message,
+                "ews_maximum_too_low",
+                minimum=f"{limits.minimum:g}",
+                maximum=f"{limits.ceiling:g}",
+            )
 
     @override
     async def command(

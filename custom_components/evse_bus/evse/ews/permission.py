@@ -139,6 +139,10 @@ class PauseTracker:
             self.doubt()
 
 
+def _waits_for_start(status: PortStatus) -> bool:
+    return status.state == WAITING and status.start is not StartRelease.RELEASED
+
+
 def _was_unlocked(before: PortStatus | None, status: PortStatus) -> bool:
     return before is not None and bool(before.locked) and status.locked is False
 
@@ -162,8 +166,9 @@ class Permission:
         self._port = port
         self._tracker = PauseTracker()
         self._started_at = -inf
-        self._start_withheld = False
-        """The user allows the car that waits, and the limit is too low for it."""
+        self._withheld_in: int | None = None
+        """The state in which the user allowed a car that waits, with a limit too low
+        for it: 0x30, or 0xF0 while the box starts."""
 
     # -- State -----------------------------------------------------------------------
 
@@ -175,12 +180,19 @@ class Permission:
     @property
     def waits_for_current(self) -> bool:
         """Return whether only the limit is too low: a higher one lets the car charge."""
-        return self._tracker.for_current or self._start_withheld
+        return self._tracker.for_current or self._withheld_in is not None
+
+    def has_ended(self, status: PortStatus) -> bool:
+        """Return whether only plugging in anew lets a car charge again."""
+        return status.state == ABORTED or (
+            status.state == ENDED and self._tracker.pause is Pause.NONE
+        )
 
     def on_status(self, status: PortStatus) -> None:
         """Check by a status whether our pause still stands, or a start is withheld."""
-        if status.state != WAITING or status.start is StartRelease.RELEASED:
-            self._start_withheld = False
+        still_starts = self._withheld_in == status.state == STARTING
+        if self._withheld_in is not None and not still_starts:
+            self._withheld_in = WAITING if _waits_for_start(status) else None
         installation = self._port.box.installation
         has_lock = installation is not None and installation.fixed_cable is False
         self._tracker.on_status(status, self._port.now, has_lock=has_lock)
@@ -197,7 +209,7 @@ class Permission:
 
     def on_lost(self) -> None:
         """Take note that the port is out of sight: another car may come unnoticed."""
-        self._start_withheld = False
+        self._withheld_in = None
 
     def withhold_start(self) -> None:
         """Take note that the user allows a charge for which the limit is too low."""
@@ -205,8 +217,8 @@ class Permission:
         if status is None:
             return
         tracker = self._tracker
-        if status.state == WAITING and status.start is not StartRelease.RELEASED:
-            self._start_withheld = True
+        if _waits_for_start(status) or status.state == STARTING:
+            self._withheld_in = status.state
         elif tracker.pause is not Pause.NONE and status.state in AFTER_OUR_PAUSE:
             tracker.for_current = True
 
@@ -269,7 +281,8 @@ class Permission:
         """
         tracker = self._tracker
         if not for_current:
-            tracker.for_current = self._start_withheld = False
+            tracker.for_current = False
+            self._withheld_in = None
         sends = 0
         status = await self._read_status(turn)
         while self._can_pause(status):
@@ -348,7 +361,8 @@ class Permission:
             else:
                 sent_at = None
                 await self._wait_for_boot(turn, patience)
-        self._tracker.for_current = self._start_withheld = False
+        self._tracker.for_current = False
+        self._withheld_in = None
 
     def _has_started(self, status: PortStatus, *, settled: bool) -> bool:
         tracker = self._tracker
@@ -381,7 +395,7 @@ class Permission:
     async def _wait_for_boot(self, turn: Turn, until: float) -> None:
         if turn.now >= until:
             message = f"{self._port.config.name} is still starting up"
-            raise NotAvailableError(message)
+            raise NotAvailableError(message, f"ews_{Refusal.NOT_READY}")
         await rest(READY_PAUSE)
 
     async def _send_start(

@@ -137,7 +137,7 @@ class PortCommands:
             await port.ready(turn)
             if order.unlocks and Capability.LOCK not in port.capabilities:
                 message = f"{port.config.name} has no lock"
-                raise NotAvailableError(message)
+                raise NotAvailableError(message, "ews_no_lock")
             try:
                 status = await port.read_fresh_status(turn)
             except ReplyTimeoutError:

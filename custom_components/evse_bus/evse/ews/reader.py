@@ -5,7 +5,7 @@ from dataclasses import fields, replace
 from typing import Final, override
 
 from ..events import ChargeStarted, Event, EventListener, port_of
-from ..model import Capability, FailSafe, Fault, Limits, Orders
+from ..model import Capability, FailSafe, Fault, Limits, Orders, PauseReason
 from .config import EwsPortConfig
 from .events import charge_ended, start_requested
 from .limit import Limiter
@@ -67,6 +67,14 @@ class EwsReader(BoxPort):
     @override
     def waits_for_current(self) -> bool:
         return self.permission.waits_for_current
+
+    @property
+    @override
+    def hindrance(self) -> PauseReason | None:
+        status = self.last_status
+        if status is not None and self.permission.has_ended(status):
+            return PauseReason.CHARGE_ENDED
+        return super().hindrance
 
     @property
     @override

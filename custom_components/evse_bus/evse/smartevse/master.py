@@ -452,8 +452,8 @@ class Master(BusMaster):
 
     @property
     @override
-    def refusal(self) -> str | None:
-        return _OTHER_MASTER if self._phase is _Phase.SILENCED else None
+    def refusal(self) -> NotAvailableError | None:
+        return _other_master() if self._phase is _Phase.SILENCED else None
 
     def unless_silent(self, request: Request) -> bytes:
         """Return the bytes of a request; called right before they are sent.
@@ -462,7 +462,7 @@ class Master(BusMaster):
         under way must not go on either.
         """
         if self.silent:
-            raise NotAvailableError(_OTHER_MASTER)
+            raise _other_master()
         return request() if callable(request) else request
 
     @override
@@ -518,6 +518,10 @@ class Master(BusMaster):
         if is_new and self.bus is not None:
             _LOGGER.warning("%s: %s", self.bus.name, _OTHER_MASTER)
             self.bus.silence(_OTHER_MASTER)
+
+
+def _other_master() -> NotAvailableError:
+    return NotAvailableError(_OTHER_MASTER, "smartevse_other_master")
 
 
 def _slave(charger: Charger) -> Slave:

@@ -59,16 +59,16 @@ def _check_changeable(reader: SmartEvseReader[SmartEvseConfig]) -> None:
     name = reader.config.name
     if reader.configuration is None:
         message = f"the load balancing of {name} has not been read yet"
-        raise NotAvailableError(message)
+        raise NotAvailableError(message, "smartevse_not_read")
     if reader.configuration.load_balancing == 0:
         message = (
             f"{name} changes its mode on request only as a load-balancing master: set "
             "LOAD BAL to Master in its menu, or change MODE there"
         )
-        raise NotAvailableError(message)
+        raise NotAvailableError(message, "smartevse_mode_load_balancing")
     if _mode_of(reader) is Mode.NORMAL:
         message = (
             f"{name} does not leave the mode normal on request: set MODE to Smart or "
             "Solar in its menu"
         )
-        raise NotAvailableError(message)
+        raise NotAvailableError(message, "smartevse_mode_normal")

@@ -136,7 +136,7 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
         """Return the dialect; raises NotAvailableError before it is known."""
         if self.dialect is None:
             message = f"{self.config.name} has not answered yet"
-            raise NotAvailableError(message)
+            raise NotAvailableError(message, "smartevse_not_read")
         return self.dialect
 
     @override

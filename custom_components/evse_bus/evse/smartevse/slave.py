@@ -273,7 +273,7 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
 
     def _refusal(self) -> NotAvailableError:
         message = f"{self.config.name}: {_OTHER_HANDSHAKE}"
-        return NotAvailableError(message)
+        return NotAvailableError(message, "smartevse_other_firmware")
 
     @override
     def on_status(self, status: Status, now: float) -> None:

@@ -198,6 +198,8 @@ class Rule:
     states: frozenset[int]
     why: str
     """Its effect in other states, or its purpose."""
+    text_key: str
+    """Key of the message for other states."""
     after_our_pause: frozenset[int] = frozenset()
     """More states, if the charge is in a pause of ours."""
 
@@ -205,6 +207,7 @@ class Rule:
 _OPTIMISABLE: Final = Rule(
     RUNNING | {FREE, SEARCHING, WAITING, ENDED},
     "a port out of order has no next start",
+    "ews_optimise_state",
 )
 
 UNLOCKED_BY_6: Final = frozenset({WAITING, ENDED})
@@ -213,23 +216,32 @@ UNLOCKED_BY_6: Final = frozenset({WAITING, ENDED})
 RULES: Final[Mapping[StartStop, Rule]] = {
     # A stop may be sent in unknown states too.
     StartStop.STOP: Rule(
-        frozenset(range(0x100)) - {STARTING, TEST}, "the box is not ready"
+        frozenset(range(0x100)) - {STARTING, TEST},
+        "the box is not ready",
+        "ews_not_ready",
     ),
     # In 0x10 there may be no car: a fixed cable is always plugged (see `state_of`).
     StartStop.REQUEST_START: Rule(
-        frozenset({WAITING}), "it would start the next car that comes"
+        frozenset({WAITING}),
+        "it would start the next car that comes",
+        "ews_request_start_state",
     ),
     StartStop.START: Rule(
         frozenset({WAITING}),
         "it would start the next car, or a charge that was stopped at the box",
+        "ews_start_state",
         AFTER_OUR_PAUSE,
     ),
     StartStop.OPTIMISE: _OPTIMISABLE,
     StartStop.DO_NOT_OPTIMISE: _OPTIMISABLE,
-    StartStop.PAUSE: Rule(RUNNING, "where nothing charges it unlocks the plug"),
+    StartStop.PAUSE: Rule(
+        RUNNING, "where nothing charges it unlocks the plug", "ews_pause_state"
+    ),
     # 3.1.8 locks while a start waits; firmware M165300100 fixed it "while charging".
     StartStop.LOCK: Rule(
-        frozenset({WAITING}), "it locks the plug of a car that waits for its start"
+        frozenset({WAITING}),
+        "it locks the plug of a car that waits for its start",
+        "ews_lock_state",
     ),
 }
 
@@ -246,11 +258,12 @@ def is_allowed(order: StartStop, state: int, *, paused: bool = False) -> bool:
 def check_order(order: StartStop, state: int, *, paused: bool = False) -> None:
     """Raise NotAvailableError where an order may not be sent (see `is_allowed`)."""
     if not is_allowed(order, state, paused=paused):
+        name = state_of(state).name
         message = (
-            f"not in state {state_of(state).name}: "
+            f"not in state {name}: "
             f"{order.name.lower().replace('_', ' ')}: {RULES[order].why}"
         )
-        raise NotAvailableError(message)
+        raise NotAvailableError(message, RULES[order].text_key, state=name)
 
 
 def unlocks(status: PortStatus) -> bool:
@@ -265,8 +278,9 @@ def unlocks(status: PortStatus) -> bool:
 def check_unlock(status: PortStatus) -> None:
     """Raise NotAvailableError where order 6 would not unlock (see `unlocks`)."""
     if not (status.locked and unlocks(status)):
+        name = state_of(status.state).name
         message = (
-            f"not in state {state_of(status.state).name}: unlock: it is for a locked "
+            f"not in state {name}: unlock: it is for a locked "
             "plug, and pauses a charge under way"
         )
-        raise NotAvailableError(message)
+        raise NotAvailableError(message, "ews_unlock_state", state=name)
