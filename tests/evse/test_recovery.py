@@ -73,7 +73,7 @@ def behind_adapter(scene: Scene) -> Adapter:
     adapter = Adapter(*scene.line.devices.values())
     scene.line = scene.bus.line = scene.bus.wire.line = adapter
     adapter.on_data = scene.bus.wire._on_data
-    adapter.on_lost = scene.bus._on_lost
+    adapter.on_lost = scene.bus.port.line_lost
     return adapter
 
 

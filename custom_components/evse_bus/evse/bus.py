@@ -1,8 +1,7 @@
 """One line's scheduler: one task owns the line, one exchange at a time.
 
-`schedule.choose` picks the next turn, `exchange.Wire` has the exchange, and
-`jobs.JobQueue` the commands; this module has the turns: presence, deadlines,
-reopening of a lost port.
+`schedule.choose` picks the next turn, `exchange.Wire` has the exchange, `port.Port` the
+port and `jobs.JobQueue` the commands; this module has the turns: presence, deadlines.
 """
 
 import asyncio
@@ -20,7 +19,6 @@ from .errors import (
     LineError,
     LineLostError,
     NotAvailableError,
-    PortMissingError,
 )
 from .exchange import Turn, Wire
 from .framing import Frame, Framer, Timing
@@ -29,8 +27,10 @@ from .line import Line
 from .listeners import Observable
 from .master import BusMaster, ChargerGroup
 from .model import OrderChange, Persistence
+from .port import Port
 from .schedule import Kind, Slot, choose
-from .throttle import LogThrottle, RateLimiter
+from .throttle import RateLimiter
+from .timer import WakeTimer
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -43,33 +43,6 @@ FAILURE_PAUSE: Final = 1.0
 FAILURES_LOGGED: Final = 20
 FAILURES_WINDOW: Final = 3600.0
 """Unexpected failures logged with a traceback within this time, s."""
-
-
-class WakeTimer:
-    """Sleeps until a time, or until something has changed."""
-
-    def __init__(self) -> None:
-        """Start without a sleeper."""
-        self._wake: asyncio.Future[None] | None = None
-
-    async def sleep_until(self, wake_at: float) -> None:
-        """Sleep until this loop time (inf: for ever), or until `wake`."""
-        loop = asyncio.get_running_loop()
-        self._wake = loop.create_future()
-        handle = None
-        if wake_at < inf:
-            handle = loop.call_at(wake_at, self.wake)
-        try:
-            await self._wake
-        finally:
-            self._wake = None
-            if handle is not None:
-                handle.cancel()
-
-    def wake(self) -> None:
-        """Wake the sleeper, if there is one."""
-        if self._wake is not None and not self._wake.done():
-            self._wake.set_result(None)
 
 
 class Bus(Observable):
@@ -91,30 +64,40 @@ class Bus(Observable):
         """
         super().__init__()
         self.line = line
-        self.name = name or line.url
         self.wire = Wire(line, framer, timing)
         self.wire.on_unsolicited = self._on_unsolicited
         self.wire.on_timeout_changed = self._update_worst_cases
         self.chargers: dict[str, Charger] = {}
-        self.connected = False
-        """The port is open."""
         self.group = group
         self.master = group if isinstance(group, BusMaster) else None
-        self._was_open = False
-        self._loss: LineLostError | None = None
-        """Why the port was closed, until the first attempt to open it again."""
-        self._log = LogThrottle(opened_by_peer=line.opened_by_peer)
         self._jobs = JobQueue()
         self._task: asyncio.Task[None] | None = None
         self._stopping = False
         self._timer = WakeTimer()
+        self.port = Port(self.wire, name or line.url, self._timer)
+        self.port.on_open = self._on_open
+        self.port.on_closed = self._jobs.fail_all
+        self.port.on_lost = self._on_lost
         self._turn_of: Slot | None = None
         self._turn_over = asyncio.Event()
         self._last_probe = -inf
         self._failures = RateLimiter(FAILURES_LOGGED, FAILURES_WINDOW)
-        line.on_lost = self._on_lost
         if group is not None:
             group.bus = self
+
+    @property
+    def name(self) -> str:
+        """Return its name, for messages."""
+        return self.port.name
+
+    @name.setter
+    def name(self, name: str) -> None:
+        self.port.name = name
+
+    @property
+    def connected(self) -> bool:
+        """Return whether the port is open."""
+        return self.port.connected
 
     # -- Life --------------------------------------------------------------------
 
@@ -127,22 +110,17 @@ class Bus(Observable):
         if self._task is not None:
             return
         self._stopping = False
-        try:
-            await self.line.open()
-        except PortMissingError:
-            if not self.line.opened_by_peer:
-                raise
+        await self.port.open()
         if self._stopping:
-            await self.line.close()
+            await self.port.close()
             message = f"{self.name} was stopped while it started"
             raise NotAvailableError(message)
-        if self.line.is_open:
-            self._on_open()
         self._task = asyncio.create_task(self._run(), name=f"bus {self.name}")
 
     async def stop(self) -> None:
         """End conversations that have begun, close the port, leave nothing behind."""
         self._stopping = True
+        self.port.give_up()
         stopped = NotAvailableError(f"{self.name} is stopped")
         self._jobs.fail_all(stopped, begun=False)
         if self._task is not None:
@@ -154,8 +132,7 @@ class Bus(Observable):
                     await self._task
             self._task = None
         self._jobs.fail_all(stopped)
-        self.connected = False
-        await self.line.close()
+        await self.port.close()
 
     async def __aenter__(self) -> Self:
         """Start, and stop at the end of the block."""
@@ -276,9 +253,9 @@ class Bus(Observable):
         while True:
             slot = None
             try:
-                if self.now >= self._renew_at:
-                    await self._renew()
-                if not self.line.is_open and not await self._reopen():
+                if self.now >= self.port.renew_at:
+                    await self.port.renew()
+                if not self.line.is_open and not await self.port.reopen():
                     return
                 self._jobs.fail_older(self.now - COMMAND_PATIENCE)
                 slots = self._slots()
@@ -287,7 +264,7 @@ class Bus(Observable):
                 choice = choose(slots, self.now, self._last_probe)
                 slot = choice.slot
                 if slot is None:
-                    wake_at = min(choice.wake_at, self._renew_at)
+                    wake_at = min(choice.wake_at, self.port.renew_at)
                     await self._timer.sleep_until(wake_at)
                     continue
                 self.wire.statistics.for_deadline += choice.for_deadline
@@ -454,10 +431,7 @@ class Bus(Observable):
 
     # -- The port ----------------------------------------------------------------
 
-    def _on_open(self) -> None:
-        was_connected = self.connected
-        self.connected = self._was_open = True
-        self.wire.reset()
+    def _on_open(self, is_new: bool) -> None:  # noqa: FBT001 - a callback
         now = self.now
         for charger in self.chargers.values():
             charger.on_line_open()
@@ -465,46 +439,16 @@ class Bus(Observable):
             charger.slot.ready = now + charger.minimum_pause(now)
         if self.master is not None:
             self.master.on_line_open(now)
-        if not was_connected:
+        if is_new:
             self.updated()
 
     def _on_lost(self, error: LineLostError) -> None:
-        self.wire.fail(error)
+        # Commands may have come while an attempt to open it again was under way.
         self._jobs.fail_all(error)
-        if self.wire.recovery.worked and not self.line.opened_by_peer:
-            # Some adapters close an idle connection: it is opened again at once, and
-            # a charger that then answers was never unavailable.
-            self._loss = error
-        else:
-            self._set_disconnected(error)
-        self.reschedule()
-
-    def _set_disconnected(self, error: LineLostError) -> None:
-        self._loss = None
-        self._log.lost(self.name, error, self.now)
-        self.connected = False
         if self.master is not None:
             self.master.slot.start_by = inf
         self._abandon_chargers(str(error))
         self.updated()
-
-    @property
-    def _renew_at(self) -> float:
-        """Return when a silent line is to be opened anew, loop time; inf: never."""
-        # A box that dials finds out by itself, and dials again.
-        if self._stopping or self.line.opened_by_peer:
-            return inf
-        return self.wire.recovery.renew_at
-
-    async def _renew(self) -> None:
-        """Close a line on which no byte comes any more; it is opened anew at once."""
-        _LOGGER.debug("%s: no reply any more, the port is opened anew", self.name)
-        self.wire.recovery.renewed()
-        self.wire.statistics.renewed += 1
-        error = LineLostError("no reply any more, the port is opened anew")
-        self._jobs.fail_all(error)
-        await self.line.close()
-        self._loss = error
 
     def silence(self, why: str) -> None:
         """Fail all waiting commands and drop all readings: the bus falls silent."""
@@ -516,34 +460,6 @@ class Bus(Observable):
         for charger in self.chargers.values():
             charger.slot.start_by = inf
             charger.set_unavailable(why)
-
-    async def _reopen(self) -> bool:
-        """Open the port again, however long it takes; False when the bus stops.
-
-        At once where its connection has worked until now.
-        """
-        while True:
-            if self._loss is None and not self._stopping:
-                # Commands may have come while an attempt was under way.
-                self._jobs.fail_all(LineLostError(f"{self.name} is not connected"))
-                pause = self.wire.recovery.next_pause()
-                await self._timer.sleep_until(self.now + pause)
-            if self._stopping:
-                return False
-            try:
-                await self.line.open()
-            except LineError as error:
-                _LOGGER.debug("%s: the port is still missing: %s", self.name, error)
-                if self._loss is not None:
-                    self._set_disconnected(self._loss)
-                continue
-            if self._was_open:
-                if self._loss is None:
-                    self._log.back(self.name)
-                self.wire.statistics.reopened += 1
-            self._loss = None
-            self._on_open()
-            return True
 
 
 def _belongs(slot: Slot, charger: Charger) -> bool:
