@@ -181,6 +181,10 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         """
         allowed = self.reading.allowed if self.reading is not None else None
         if allowed is False and not self.waits_for_current:
+            # Behind a disabled outlet nothing is allowed, whatever was ordered.
+            disabled = self.hindrance is PauseReason.OUTLET_DISABLED
+            if disabled and self.effective_orders.allowed is not False:
+                return PauseReason.OUTLET_DISABLED
             return PauseReason.NOT_ALLOWED
         inputs = (self.effective_orders, self.limits)
         if self._reason is None or self._reason[0] != inputs:
