@@ -58,7 +58,9 @@ class Car:
     It follows a changed offer after `reaction` seconds, at `max_current` per `ramp`
     seconds. Below its minimum it stops. `greedy`: factor by which it draws more than
     offered (1.1 = 10 % too much). `wanted_wh` = None: never full. `requests_without_pwm`:
-    requests (6 V) even when the PWM has stopped; a real car does not.
+    requests (6 V) even when the PWM has stopped; a real car does not. `drawn_anyway`:
+    current that it draws while plugged in, whatever is offered and even if the
+    contactor was opened (A; a welded contactor, or another supply of the car).
     The methods may be called from any thread at any time.
     """
 
@@ -75,6 +77,7 @@ class Car:
         cos_phi: float = 0.98,
         greedy: float = 1.0,
         requests_without_pwm: bool = False,
+        drawn_anyway: float = 0.0,
         life: CarLife | None = None,
     ) -> None:
         """Make a car that is away."""
@@ -88,6 +91,7 @@ class Car:
         self.cos_phi = cos_phi
         self.greedy = greedy
         self.requests_without_pwm = requests_without_pwm
+        self.drawn_anyway = drawn_anyway
         self.life = life
         self.plugged = False
         self.requesting = False
@@ -165,14 +169,15 @@ class Car:
     def _step(
         self, now: float, seconds: float, offered: float | None, voltage: float
     ) -> float:
-        if offered is None or not self.plugged:
+        if (offered is None and not self.drawn_anyway) or not self.plugged:
             # The contactor is open: no current at once, and a new start later.
             self.current = self._target = self._new_target = 0.0
             self._new_target_at = now
             return 0.0
         target = 0.0
-        if self.requesting and offered >= self.min_current:
+        if self.requesting and offered is not None and offered >= self.min_current:
             target = min(offered * self.greedy, self.max_current)
+        target = max(target, self.drawn_anyway)
         if target != self._new_target:
             self._new_target = target
             self._new_target_at = now

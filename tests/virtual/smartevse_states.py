@@ -92,6 +92,8 @@ class SmartEvseStates:
         """Begin with the stored settings: all volatile state is lost."""
         self.settings = dict(self.stored)
         self.state = "A"
+        # A defect: access that is off does not change the state.
+        self.keeps_charging = False
         self.access = False
         self.error = 0
         self.contactor = False
@@ -164,7 +166,7 @@ class SmartEvseStates:
     def set_access(self, allowed: bool) -> None:  # noqa: FBT001 - a register's value
         """Set the access bit."""
         self.access = allowed
-        if allowed:
+        if allowed or self.keeps_charging:
             return
         if not self.dialect.gentle:
             self.go("A")

@@ -46,6 +46,7 @@ from .model import (
     Setting,
     Status,
 )
+from .pause_watch import PauseWatch
 from .readings import ChargerInfo, ChargerReading
 from .safety import (
     Setpoint,
@@ -121,6 +122,7 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         self.available = False
         """It answers, and its reading is up to date."""
         self._presence = PresenceLog()
+        self._pause_watch = PauseWatch()
         self.noticed: frozenset[Fault] = frozenset()
         """Faults found by this library, beside those the charger reports."""
         self.orders_expired = False
@@ -577,6 +579,13 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         if present != (fault in self.noticed):
             self.noticed = self.noticed ^ {fault}
             self.updated()
+
+    def watch_pause(self, now: float, *, shown: bool, patience: float | None) -> None:
+        """Notice a car that charges against a pause (see `PauseWatch.charges`)."""
+        against = self._pause_watch.charges(
+            now, ordered=self.setpoint.paused, shown=shown, patience=patience
+        )
+        self.notice(Fault.CHARGES_ALTHOUGH_PAUSED, present=against)
 
 
 async def _no_commit(_orders: Orders) -> None:

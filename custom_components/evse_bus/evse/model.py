@@ -77,6 +77,7 @@ class Fault(StrEnum):
     # Found by this library.
     UNSUPPORTED_FIRMWARE = "unsupported_firmware"
     SECOND_MASTER = "second_master"
+    CHARGES_ALTHOUGH_PAUSED = "charges_although_paused"
     LIMIT_EXCEEDED = "limit_exceeded"
     LIMIT_NOT_TAKEN = "limit_not_taken"
     WRONG_CHARGER = "wrong_charger"

@@ -96,34 +96,30 @@ def test_row_1_word_3_tells_a_pause_whatever_ic_shows(state: int, ic: int) -> No
 
 @pytest.mark.parametrize("state", [C2, C3, C4, 0xA0, 0xD1])
 @pytest.mark.parametrize(
-    ("order", "charging", "current", "write", "problem"),
+    ("order", "charging", "write"),
     [
         # Written just now: the car has 10 s.
-        (pause(acknowledged=2, standing_for=2), 60, 9.0, False, False),
-        (pause(acknowledged=9, standing_for=9), 60, 9.0, False, False),
-        (pause(acknowledged=10, standing_for=10), 60, 9.0, True, True),
-        (pause(acknowledged=10, standing_for=10), 60, None, True, False),
-        (pause(acknowledged=10, standing_for=10), 60, 0.5, True, False),
-        # Without a measured current, 30 s.
-        (pause(acknowledged=5, standing_for=30), 60, None, False, True),
+        (pause(acknowledged=2), 60, False),
+        (pause(acknowledged=9), 60, False),
+        (pause(acknowledged=10), 60, True),
         # It came to C after the write, or nothing was written since connecting.
-        (pause(acknowledged=100, standing_for=100), 0, 9.0, True, False),
-        (pause(), 0, None, True, False),
+        (pause(acknowledged=100), 0, True),
+        (pause(), 0, True),
     ],
 )
-def test_row_2_a_car_that_is_not_off_yet(  # noqa: PLR0917
+def test_row_2_a_car_that_is_not_off_yet(
     state: int,
     order: Standing,
     charging: float,
-    current: float | None,
     write: bool,  # noqa: FBT001
-    problem: bool,  # noqa: FBT001
 ) -> None:
-    seen = reports(PAUSE, state=state, charging_for=charging, current=current)
+    seen = reports(PAUSE, state=state, charging_for=charging)
     decision = decide(seen, order)
-    assert (decision.write, decision.ignored) == (write, problem)
-    assert decision.paused is True
-    assert decision.state is (NOT_TAKEN if problem else CONFIRMED)
+    assert summary(decision) == (CONFIRMED, True, write)
+    too_long = decide(seen, replace(order, charges=True))
+    assert summary(too_long) == (NOT_TAKEN, True, write)
+    # The box has taken it: the car is the problem.
+    assert not too_long.ignored
     # Nor is a pause by another ended, or repeated.
     assert not decide(seen, limit()).write
 
@@ -250,24 +246,29 @@ def test_row_12_a_pause_that_is_not_read_back(
 
 
 @pytest.mark.parametrize(
-    ("order", "charging", "write", "problem"),
+    ("order", "charging", "write", "state", "ignored"),
     [
-        (pause(acknowledged=9, standing_for=9), 60, False, False),
-        (pause(acknowledged=10, standing_for=10), 60, True, False),
-        (pause(acknowledged=60, standing_for=60), 1, True, False),
-        (pause(), 60, True, False),
-        (pause(acknowledged=2, standing_for=20, failed=True), 60, False, True),
+        (pause(acknowledged=9), 60, False, NOT_READ_BACK, False),
+        (pause(acknowledged=10), 60, True, NOT_READ_BACK, False),
+        (pause(acknowledged=60), 1, True, NOT_READ_BACK, False),
+        (pause(), 60, True, NOT_READ_BACK, False),
+        # Acknowledged, the box has taken it: the car is the problem.
+        (pause(acknowledged=2, charges=True), 60, False, NOT_TAKEN, False),
+        (pause(acknowledged=2, failed=True), 60, False, NOT_TAKEN, False),
+        (pause(failed=True), 60, True, NOT_TAKEN, True),
     ],
 )
 def test_row_13_a_pause_not_followed_yet(
     order: Standing,
     charging: float,
     write: bool,  # noqa: FBT001
-    problem: bool,  # noqa: FBT001
+    state: OrderState,
+    ignored: bool,  # noqa: FBT001
 ) -> None:
     for seen in (silent(DEFAULT, C2), reports(None, state=C2)):
         decision = decide(replace(seen, charging_for=charging), order)
-        assert (decision.write, decision.ignored) == (write, problem)
+        assert (decision.write, decision.ignored) == (write, ignored)
+        assert decision.state is state
 
 
 @pytest.mark.parametrize("state", IDLE)
@@ -290,13 +291,13 @@ _standing = st.builds(
     Standing,
     code=st.just(PAUSE) | st.integers(100, 970),
     acknowledged=st.none() | st.floats(0, 100),
-    standing_for=st.floats(0, 100),
     state_changed=st.booleans(),
     raised=st.booleans(),
     confirmed=st.booleans(),
     missed=st.booleans(),
     allowed=st.booleans(),
     failed=st.booleans(),
+    charges=st.booleans(),
 )
 
 

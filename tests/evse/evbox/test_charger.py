@@ -605,6 +605,43 @@ def test_a_limit_that_is_not_kept_is_a_fault() -> None:
     simulate(scene())
 
 
+@pytest.mark.parametrize("anyway", [0.8, 9.0])
+def test_a_car_that_charges_at_0_a_is_a_fault(anyway: float) -> None:
+    async def scene() -> None:
+        car = Car(max_current=32.0, drawn_anyway=anyway)
+        car.plug_in()
+        point = box(Module(car), Module())
+        async with Scene.of(point) as stage:
+            charger = stage.add()
+            await asyncio.sleep(40.0)
+            assert charger.faults == frozenset()
+            await charger.change_orders(OrderChange(allowed=False))
+            # The time to follow (manual, note **), and the period.
+            await asyncio.sleep(14.0)
+            assert charger.faults == frozenset()
+            await asyncio.sleep(10.0)
+            assert charger.faults == {Fault.CHARGES_ALTHOUGH_PAUSED}
+            car.drawn_anyway = 0.0
+            await asyncio.sleep(10.0)
+            assert charger.faults == frozenset()
+
+    simulate(scene())
+
+
+def test_a_sleeping_car_is_no_fault() -> None:
+    async def scene() -> None:
+        # Three modules together draw more than one car may.
+        cars = [Car(drawn_anyway=0.4) for _ in range(3)]
+        for car in cars:
+            car.plug_in(request=False)
+        async with Scene.of(box(*map(Module, cars))) as stage:
+            charger = stage.add(orders=replace(ORDERS, allowed=False))
+            await asyncio.sleep(60.0)
+            assert charger.faults == frozenset()
+
+    simulate(scene())
+
+
 def test_a_car_that_follows_slowly_is_no_fault() -> None:
     async def scene() -> None:
         car = Car(max_current=32.0, reaction=9.0, ramp=1.0)
@@ -618,6 +655,9 @@ def test_a_car_that_follows_slowly_is_no_fault() -> None:
             await charger.change_orders(OrderChange(current=6.0))
             await asyncio.sleep(60.0)
             assert point.modules[0].measured()[0] == (6.0, 6.0, 6.0)
+            await charger.change_orders(OrderChange(allowed=False))
+            await asyncio.sleep(60.0)
+            assert point.modules[0].measured()[0] == (0.0, 0.0, 0.0)
             assert faults == set()
 
     simulate(scene())

@@ -5,7 +5,7 @@ from contextlib import suppress
 
 import pytest
 
-from custom_components.evse_bus.evse.errors import EvseError
+from custom_components.evse_bus.evse.errors import EvseError, NotConfirmedError
 from custom_components.evse_bus.evse.model import (
     Circuit,
     Fault,
@@ -186,6 +186,27 @@ def test_a_box_that_does_not_stop_is_a_fault() -> None:
             await asyncio.sleep(6)
             assert scene.offers == 0
             assert Fault.LIMIT_NOT_TAKEN not in scene.slave(2).faults
+
+    simulate(scene())
+
+
+def test_a_slave_that_charges_without_access_is_a_fault() -> None:
+    async def scene() -> None:
+        async with MasterScene(units=(2,), watch=False) as scene:
+            await asyncio.sleep(5)
+            await scene.charge(2)
+            await asyncio.sleep(3)
+            slave = scene.slave(2)
+            outlet = scene.box(2).controller.outlet
+            outlet.keeps_charging = True
+            with pytest.raises(NotConfirmedError):
+                await slave.change_orders(OrderChange(allowed=False))
+            await asyncio.sleep(12)
+            assert Fault.CHARGES_ALTHOUGH_PAUSED in slave.faults
+            outlet.keeps_charging = False
+            outlet.set_access(allowed=False)
+            await asyncio.sleep(6)
+            assert Fault.CHARGES_ALTHOUGH_PAUSED not in slave.faults
 
     simulate(scene())
 

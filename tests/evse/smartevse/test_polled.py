@@ -294,6 +294,40 @@ def test_a_box_that_ignores_the_access_bit(dialect: Dialect) -> None:
 
 
 @each
+def test_a_car_that_charges_without_access_is_a_fault(dialect: Dialect) -> None:
+    async def acts(scene: PolledScene) -> None:
+        await scene.charge()
+        assert not scene.charger.faults
+        scene.outlet.keeps_charging = True
+        begin = now()
+        with pytest.raises(NotConfirmedError):
+            await scene.charger.change_orders(OrderChange(allowed=False))
+        assert not scene.outlet.access
+        await scene.until(lambda: scene.charger.faults, 60)
+        assert now() - begin >= 10
+        # The box has taken the order.
+        assert scene.charger.faults == {Fault.CHARGES_ALTHOUGH_PAUSED}
+        assert scene.reading.allowed is False
+        scene.outlet.keeps_charging = False
+        scene.outlet.set_access(allowed=False)
+        await scene.until(lambda: not scene.charger.faults, 30)
+
+    play(PolledScene(dialect), acts)
+
+
+@each
+def test_access_turned_off_at_the_box_counts_as_well(dialect: Dialect) -> None:
+    async def acts(scene: PolledScene) -> None:
+        await scene.charge()
+        scene.outlet.keeps_charging = True
+        scene.outlet.set_access(allowed=False)
+        await scene.until(lambda: scene.charger.faults, 60)
+        assert scene.charger.faults == {Fault.CHARGES_ALTHOUGH_PAUSED}
+
+    play(PolledScene(dialect), acts)
+
+
+@each
 def test_lost_answers(dialect: Dialect) -> None:
     """A write whose reply is lost is confirmed by its read-back."""
 

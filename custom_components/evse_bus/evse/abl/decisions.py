@@ -16,10 +16,6 @@ from .states import A1, B1, B2, E0, SETUP, is_failure
 
 GRACE: Final = 10.0
 """Time for a car to follow a pause or a limit that the box has taken."""
-STILL_CHARGING: Final = 30.0
-"""A box in C for so long after its pause has not followed it."""
-NO_CURRENT: Final = 0.5
-"""A: a pause lets no more than this flow."""
 EXCESS: Final = 1.0
 """A above a limit that show that it is not followed."""
 REPEAT_PAUSE: Final = 60.0
@@ -39,6 +35,11 @@ IDLE: Final = frozenset({A1, B1, B2, E0})
 """The contactor is open; all other states count as C, but for Ex and Fx."""
 _LOWEST: Final = 0x50
 _HIGHEST: Final = 0x3CA
+
+
+def is_charging(state: int) -> bool:
+    """Return whether a state byte is C or counts as C."""
+    return not (state in IDLE | SETUP or is_failure(state))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,6 +64,11 @@ class Evidence:
         """Return whether the contactor is open."""
         return self.state in IDLE
 
+    @property
+    def charging(self) -> bool:
+        """Return whether it is in C, or in a state that counts as C."""
+        return is_charging(self.state)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Standing:
@@ -72,8 +78,6 @@ class Standing:
     """Icmax that it comes to, 0.1 %; `PAUSE`: charging is not allowed."""
     acknowledged: float | None = None
     """Time since the last acknowledged write of it; ``None``: none since connecting."""
-    standing_for: float = 0.0
-    """Time since its first write."""
     state_changed: bool = False
     """The state has changed since that acknowledged write."""
     raised: bool = False
@@ -86,6 +90,8 @@ class Standing:
     """The user has allowed charging since connecting."""
     failed: bool = False
     """Three writes have not been followed."""
+    charges: bool = False
+    """A car charges although the box is paused, for too long."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,7 +107,7 @@ class Decision:
     write: bool = False
     """The order is to be written, as soon as `Writes` permits."""
     ignored: bool = False
-    """The box or its car does not follow, for too long."""
+    """The box does not take it, for too long."""
 
 
 def decide(seen: Evidence, order: Standing) -> Decision:
@@ -133,13 +139,11 @@ def _paused(seen: Evidence, order: Standing) -> Decision:
     confirmed = Decision(state=OrderState.CONFIRMED, paused=True, offered=PAUSE)
     if seen.idle or seen.ic == PAUSE:
         return confirmed
-    too_long = _not_followed(seen, order)
     return Decision(
-        state=OrderState.NOT_TAKEN if too_long else OrderState.CONFIRMED,
+        state=OrderState.NOT_TAKEN if order.charges else OrderState.CONFIRMED,
         paused=True,
         offered=PAUSE,
         write=_write_in_c(seen, order),
-        ignored=too_long,
     )
 
 
@@ -151,12 +155,6 @@ def _write_in_c(seen: Evidence, order: Standing) -> bool:
     """
     since = order.acknowledged
     return since is None or seen.charging_for < since or since >= GRACE
-
-
-def _not_followed(seen: Evidence, order: Standing) -> bool:
-    time = min(seen.charging_for, order.standing_for)
-    flows = seen.current is not None and seen.current > NO_CURRENT
-    return time >= STILL_CHARGING or (time >= GRACE and flows)
 
 
 def _read_back(seen: Evidence, order: Standing, icmax: int) -> Decision:
@@ -189,16 +187,16 @@ def _exceeds(seen: Evidence, order: Standing) -> bool:
 
 def _pause_not_read_back(seen: Evidence, order: Standing) -> Decision:
     """Rows 12 and 13: a pause on a box that does not show it."""
-    if not seen.idle:
-        ignored = order.failed or _not_followed(seen, order)
-        return Decision(
-            state=OrderState.NOT_TAKEN if ignored else OrderState.NOT_READ_BACK,
-            paused=True if order.acknowledged is not None else None,
-            offered=PAUSE if order.acknowledged is not None else None,
-            write=_write_in_c(seen, order),
-            ignored=ignored,
-        )
     since = order.acknowledged
+    if not seen.idle:
+        not_taken = order.failed or order.charges
+        return Decision(
+            state=OrderState.NOT_TAKEN if not_taken else OrderState.NOT_READ_BACK,
+            paused=True if since is not None else None,
+            offered=PAUSE if since is not None else None,
+            write=_write_in_c(seen, order),
+            ignored=order.failed and since is None,
+        )
     unknown = since is None or order.state_changed or since >= REPEAT_PAUSE
     return Decision(
         state=OrderState.NOT_READ_BACK,
@@ -315,10 +313,6 @@ class Writes:
     def forget(self) -> None:
         """Drop the acknowledgement: the box may have lost the order since."""
         self.acknowledged = None
-
-    def standing_for(self, code: int, now: float) -> float:
-        """Return the time since the first write of a code, s."""
-        return now - self._first if code == self.code else 0.0
 
     def failed(self, code: int, now: float) -> bool:
         """Return whether three writes of a code should have been followed by now."""

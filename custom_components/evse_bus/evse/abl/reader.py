@@ -21,19 +21,20 @@ from ..errors import (
 )
 from ..exchange import Turn
 from ..model import ChargerConfig, Fault, Orders, OrderState
+from ..pause_watch import FOLLOW_TIME, NO_CURRENT
 from ..registers import Registers
 from ..safety import Setpoint
 from .config import TIMING, AblConfig, Pauses
 from .decisions import (
     FAILED_AFTER,
     FRESH,
-    IDLE,
     Decision,
     Evidence,
     Standing,
     Writes,
     believed_paused,
     decide,
+    is_charging,
 )
 from .duty import PAUSE, highest_current
 from .readings import (
@@ -67,7 +68,7 @@ from .registers import (
     write_limit,
     write_state,
 )
-from .states import E0, SETUP, is_failure
+from .states import E0
 
 FLAGS_INTERVAL: Final = 30.0
 """Time between two reads of the system flags, s."""
@@ -82,6 +83,10 @@ ICMAX_PROBES: Final = 3
 """Unanswered reads of 0x000F, each after another reply, that prove its absence."""
 ICMAX_ABSENT: Final = 600.0
 """Time after which that is tried again, s."""
+
+STILL_CHARGING: Final = 30.0
+"""A box that measures no current, and is in C for so long after its pause, has not
+followed it, s."""
 
 E0_OURS: Final = 60.0
 """An E0 so soon after a request for it is no E0 by itself, s."""
@@ -326,6 +331,14 @@ class AblReader(Charger[AblConfig]):
         self.reading = reading
         if changed:
             self.updated()
+        self._watch_pause(self.evidence(status, now), now)
+
+    def _watch_pause(self, seen: Evidence, now: float) -> None:
+        """Notice a car that charges against a pause (rows 2 and 13)."""
+        patience = STILL_CHARGING if seen.charging else None
+        if seen.current is not None and seen.current > NO_CURRENT:
+            patience = FOLLOW_TIME
+        self.watch_pause(now, shown=believed_paused(seen) is True, patience=patience)
 
     def _note_e0(self, state: int, now: float) -> None:
         before = self.last_status
@@ -356,8 +369,7 @@ class AblReader(Charger[AblConfig]):
         )
 
     def _note_state(self, state: int, now: float) -> None:
-        charging = not (state in IDLE | SETUP or is_failure(state))
-        if not charging:
+        if not is_charging(state):
             self._charging_since = inf
         elif self._charging_since == inf:
             self._charging_since = now
@@ -446,13 +458,13 @@ class AblReader(Charger[AblConfig]):
         return Standing(
             code=code,
             acknowledged=None if acknowledged is None else now - acknowledged,
-            standing_for=writes.standing_for(code, now),
             state_changed=self._state_written != self._state,
             raised=self.raise_pending,
             confirmed=self.confirmed is not None,
             missed=self.missed,
             allowed=self.allowed_by_user,
             failed=writes.failed(code, now),
+            charges=Fault.CHARGES_ALTHOUGH_PAUSED in self.noticed,
         )
 
     def decide(self, now: float) -> Decision | None:
@@ -542,7 +554,10 @@ class AblReader(Charger[AblConfig]):
                 break
             await rest(min(next(pauses), max(until - turn.now, 0.0)))
             has_rested = True
-        self.notice(Fault.LIMIT_NOT_TAKEN, present=True)
+        # Where the pause is taken, the car alone is the problem (`_watch_pause`).
+        taken = code == PAUSE and self.writes.acknowledged is not None
+        not_taken = not taken or self.paused is False
+        self.notice(Fault.LIMIT_NOT_TAKEN, present=not_taken)
         if refused is not None:
             raise refused
         message = f"{self.config.name} does not follow its limit"

@@ -37,6 +37,7 @@ from ..model import (
     Orders,
     Phases,
 )
+from ..pause_watch import NO_CURRENT
 from ..readings import ChargerReading
 from ..safety import INTERVALS_PER_TIMEOUT, MAXIMUM_TIMEOUT, Setpoint, clamp, number
 from ..schedule import Kind
@@ -335,7 +336,13 @@ class EvboxCharger(Charger[EvboxConfig]):
         reply = accepted.reply
         grace = max(_SHORTEST_GRACE, FOLLOW_TIME + self._period)
         exceeded = self._monitor.exceeded(now, used_currents(reply), grace)
-        self.notice(Fault.LIMIT_EXCEEDED, present=exceeded)
+        confirmed = self._confirmed
+        is_paused = confirmed is not None and confirmed.paused
+        highest = max((max(one.currents) for one in reply.modules), default=0.0)
+        self.watch_pause(
+            now, shown=is_paused, patience=grace if highest > NO_CURRENT else None
+        )
+        self.notice(Fault.LIMIT_EXCEEDED, present=exceeded and not is_paused)
         self.notice(Fault.OVERCURRENT, present=accepted.over_current)
         self.notice(Fault.IMPLAUSIBLE, present=accepted.out_of_range)
         if self._monitor.unconfirmed:

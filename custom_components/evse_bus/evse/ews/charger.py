@@ -14,6 +14,7 @@ from ..errors import EvseError, ImplausibleReplyError, NotAvailableError
 from ..exchange import Turn
 from ..framing import Frame
 from ..model import ChargerConfig, Command, Fault, OrderChange, Orders
+from ..pause_watch import FOLLOW_TIME, NO_CURRENT
 from ..safety import clamp
 from .config import EwsPortConfig
 from .port_commands import PortCommands
@@ -67,7 +68,22 @@ class EwsPort(EwsReader):
             self.on_implausible()
             raise
         self.take_status()
+        self.watch_pause(
+            turn.now,
+            shown=self.reading is not None and self.reading.allowed is False,
+            patience=FOLLOW_TIME if self._flows else None,
+        )
         return self._next_action(turn.now)
+
+    @property
+    def _flows(self) -> bool:
+        """Return whether a car charges, by the status or by the power of the port."""
+        if self.reading is None:
+            return False
+        connector = self.reading.connectors[self.number]
+        power = connector.power or 0.0
+        # The sum of the phases: so much on one of them.
+        return connector.charging is True or power > NO_CURRENT * self.config.voltage
 
     # -- Maintenance -------------------------------------------------------------------
 

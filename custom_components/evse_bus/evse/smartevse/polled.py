@@ -300,7 +300,9 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
         try:
             await self.set_access(turn, allowed=False)
         except NotConfirmedError:
-            self.notice(Fault.LIMIT_NOT_TAKEN, present=True)
+            # Where access is off, the car alone is the problem (`watch_pause`).
+            taken = self.status is not None and not self.status.access
+            self.notice(Fault.LIMIT_NOT_TAKEN, present=not taken)
             raise
         self._paused_for_limit = ours and (had_access or self._paused_for_limit)
         if not ours:

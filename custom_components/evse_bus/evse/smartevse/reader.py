@@ -30,6 +30,7 @@ from ..model import (
     Orders,
     Setting,
 )
+from ..pause_watch import FOLLOW_TIME
 from ..registers import Block
 from .config import SmartEvseConfig
 from .dialects import MAPS, PROBE_A0, Dialect, Status
@@ -47,7 +48,7 @@ from .registers import (
     write_access,
     write_answer,
 )
-from .states import UNPLUGGED, is_stopped, shows_plug
+from .states import CHARGING, UNPLUGGED, is_stopped, shows_plug
 
 TIMING: Final = Timing(
     # More than 3 ms of silence end a frame, and a box replies after more than 6 ms.
@@ -301,6 +302,11 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
         if reading != self.reading:
             self.reading = reading
             self.updated()
+        self.watch_pause(
+            now,
+            shown=not status.access,
+            patience=FOLLOW_TIME if status.raw_state in CHARGING else None,
+        )
 
     # -- Configuration -------------------------------------------------------------
 
