@@ -6,8 +6,10 @@ here, because the devices break rules that pymodbus' and other frame splitters r
 good frame behind a broken one must not be lost.
 """
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 import re
 from typing import Final, override
 
@@ -19,6 +21,7 @@ from pymodbus.pdu.register_message import (
     WriteSingleRegisterRequest,
 )
 
+from .crc16 import RunningCrc
 from .framing import Frame, Framer
 
 READ_HOLDING_REGISTERS: Final = 0x03
@@ -33,8 +36,10 @@ _SHORTEST: Final = 3
 """Minimum length of a frame, bytes: unit, function, checksum."""
 _LONGEST: Final = 255
 """Maximum length of a frame, bytes (Modbus over serial line, 2.5.2.1)."""
-_FRAME: Final = re.compile(rb"[>:]([0-9A-Fa-f]{0,%d})(\r\n?)?" % (2 * _LONGEST))
-"""A start and the hex digits behind it, with the end if it has arrived."""
+_LONGEST_TEXT: Final = 1 + 2 * _LONGEST
+"""Characters of such a frame before its end."""
+_START: Final = re.compile(rb"[>:]")
+_NO_DIGIT: Final = re.compile(rb"[^0-9A-Fa-f]")
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +139,7 @@ class AsciiFramer(Framer[ModbusFrame]):
     def __init__(self) -> None:
         """Start with an empty buffer."""
         super().__init__()
-        self._buffer = b""
+        self._buffer = bytearray()
 
     @property
     @override
@@ -144,37 +149,57 @@ class AsciiFramer(Framer[ModbusFrame]):
     @override
     def reset(self) -> None:
         self.noise += len(self._buffer)
-        self._buffer = b""
+        self._buffer.clear()
 
     @override
     def feed(self, data: bytes) -> list[ModbusFrame]:
-        buffer = self._buffer + data
         frames: list[ModbusFrame] = []
-        position = 0
-        while (found := _FRAME.search(buffer, position)) is not None:
-            self.noise += found.start() - position
-            position = found.end()
-            if found[2] == _END:
-                if (frame := _decode(found[0], found[1])) is not None:
-                    frames.append(frame)
-                else:
-                    self.bad += 1
-            elif position == len(buffer):
-                # The end has not arrived yet.
-                self._buffer = found[0]
-                return frames
-            elif buffer[position : position + 1] in (b">", b":"):
-                # The next frame starts before the end of this one.
-                self.noise += len(found[0])
-            else:
-                self.bad += 1
-        self.noise += len(buffer) - position
-        self._buffer = b""
+        at = 0
+        while at < len(data):
+            if self._buffer:
+                at = self._go_on(data, at, frames)
+                continue
+            start = _START.search(data, at)
+            if start is None:
+                self.noise += len(data) - at
+                break
+            self.noise += start.start() - at
+            self._buffer += start[0]
+            at = start.end()
         return frames
 
+    def _go_on(self, data: bytes, at: int, frames: list[ModbusFrame]) -> int:
+        """Go on with the frame that has begun; return the place of what is left."""
+        buffer = self._buffer
+        if not buffer.endswith(_END[:1]):
+            most = min(at + _LONGEST_TEXT - len(buffer), len(data))
+            other = _NO_DIGIT.search(data, at, most)
+            end = most if other is None else other.start()
+            buffer += data[at:end]
+            at = end
+            if data[at : at + 1] == _END[:1]:
+                buffer += _END[:1]
+                at += 1
+            if at == len(data):
+                return at
+        if buffer.endswith(_END[:1]) and data[at : at + 1] == _END[1:]:
+            at += 1
+            frame = _decode(bytes(buffer + _END[1:]))
+            if frame is not None:
+                frames.append(frame)
+            self.bad += frame is None
+        elif _START.match(data, at):
+            # The next frame starts before the end of this one.
+            self.noise += len(buffer)
+        else:
+            self.bad += 1
+        buffer.clear()
+        return at
 
-def _decode(raw: bytes, digits: bytes) -> ModbusFrame | None:
-    """Return the frame of these digits; ``None``: not a valid one."""
+
+def _decode(raw: bytes) -> ModbusFrame | None:
+    """Return the frame of these characters; ``None``: not a valid one."""
+    digits = raw[1 : -len(_END)]
     if len(digits) % 2 or len(digits) < 2 * _SHORTEST:
         return None
     content = bytes.fromhex(digits.decode())
@@ -201,8 +226,16 @@ _RTU_WRITE_HEAD: Final = 7
 """Bytes of a request to write several registers, up to and including its byte count."""
 _RTU_LONGEST: Final = 256
 """Maximum length of a frame, bytes (Modbus over serial line, 2.5.1)."""
+_RTU_PIECE: Final = 4 * _RTU_LONGEST
+"""So many bytes are searched for frames at once."""
 _READS: Final = (READ_HOLDING_REGISTERS, READ_INPUT_REGISTERS)
 _KNOWN: Final = (*_READS, WRITE_SINGLE_REGISTER, WRITE_MULTIPLE_REGISTERS)
+_RTU_COUNTED: Final = (
+    (_READS, _RTU_READ_HEAD),
+    ((WRITE_MULTIPLE_REGISTERS,), _RTU_WRITE_HEAD),
+)
+"""Functions with a byte count, and where it is: at the end of so many bytes."""
+_COUNTED_RANK, _FIXED_RANK, _EXCEPTION_RANK = range(3)
 
 
 def crc(data: bytes) -> bytes:
@@ -216,18 +249,43 @@ def rtu_frame(unit: int, pdu: bytes) -> bytes:
     return content + crc(content)
 
 
+@dataclass(slots=True)
+class _Start:
+    """A byte that may be the first of a frame; places count from the first byte ever.
+
+    Of the lengths that a frame may have here, the one of the lowest rank is believed.
+    """
+
+    at: int
+    open_until: int
+    """Where the longest of these frames ends."""
+    rank: int = _EXCEPTION_RANK
+    length: int = 0
+    """Length of the frame with a good checksum; 0: there is none."""
+
+
 class RtuFramer(Framer[ModbusFrame]):
     """Finds frames of Modbus RTU by their length and checksum.
 
     The pauses between frames do not survive an adapter, so they are not used. A frame
     may be a request or a reply of any device; exceptions are recognised with the 0x80
     in their function and without.
+
+    No more than the longest frame is kept, and a byte costs the same whatever came
+    before it: each possible frame is checked once, when its last byte arrives.
     """
 
     def __init__(self) -> None:
         """Start with an empty buffer."""
         super().__init__()
-        self._buffer = b""
+        self._buffer = bytearray()
+        self._crc = RunningCrc()
+        self._starts: list[_Start] = []
+        """One for each byte of the buffer."""
+        self._dropped = 0
+        """Place of the first byte of the buffer."""
+        self._due: dict[int, list[tuple[_Start, int, int]]] = {}
+        """Possible frames (start, rank, length) by the place where they end."""
 
     @property
     @override
@@ -237,91 +295,118 @@ class RtuFramer(Framer[ModbusFrame]):
     @override
     def reset(self) -> None:
         self.noise += len(self._buffer)
-        self._buffer = b""
+        self._drop(len(self._buffer))
 
     @override
     def feed(self, data: bytes) -> list[ModbusFrame]:
-        buffer = self._buffer + data
         frames: list[ModbusFrame] = []
-        taken = position = 0
-        begun: int | None = None
-        while position < len(buffer):
-            lengths = _rtu_lengths(buffer, position)
-            frame = _rtu_decode(buffer, position, lengths)
-            if begun is not None and frame is not None and _is_weak(frame):
-                # The unfinished frame before it may contain the same bytes.
-                frame = None
-            if frame is not None:
-                self._lose(buffer[taken:position])
-                frames.append(frame)
-                position += len(frame.raw)
-                taken, begun = position, None
-                continue
-            if begun is None and any(position + n > len(buffer) for n in lengths):
-                begun = position
-            position += 1
-        kept = len(buffer) if begun is None else begun
-        self._lose(buffer[taken:kept])
-        self._buffer = buffer[kept:]
+        for at in range(0, len(data), _RTU_PIECE):
+            sure: list[_Start] = []
+            for byte in data[at : at + _RTU_PIECE]:
+                self._append(byte)
+                sure += self._checked()
+            frames += self._take(sorted(sure, key=attrgetter("at")))
         return frames
 
-    def _lose(self, data: bytes) -> None:
-        """Count bytes that belong to no frame."""
-        self.noise += len(data)
-        self.bad += len(data) >= _RTU_EXCEPTION
+    def _append(self, byte: int) -> None:
+        """Take a byte, and what it decides about the frames that it may belong to."""
+        self._buffer.append(byte)
+        self._crc.append(byte)
+        end = self._dropped + len(self._buffer)
+        # Until its function arrives, any byte may be the first of a frame.
+        self._starts.append(_Start(end - 1, open_until=end + 1))
+        if len(self._buffer) > 1:
+            self._expect(self._starts[-2], byte)
+        for functions, head in _RTU_COUNTED:
+            if len(self._buffer) >= head and self._buffer[1 - head] in functions:
+                self._expect_counted(self._starts[-head], head, byte)
 
+    def _expect(self, start: _Start, function: int) -> None:
+        """Expect the frames with this function."""
+        start.open_until = start.at
+        if function & ~EXCEPTION not in _KNOWN:
+            return
+        self._expect_frame(start, _EXCEPTION_RANK, _RTU_EXCEPTION)
+        if not function & EXCEPTION and function not in _READS:
+            self._expect_frame(start, _FIXED_RANK, _RTU_FIXED)
+        elif not function & EXCEPTION:
+            # When its third byte has come, before any of these frames can end.
+            start.open_until = start.at + _RTU_FIXED
 
-def _is_weak(frame: ModbusFrame) -> bool:
-    """Return whether the checksum is the only evidence that this is a frame."""
-    return len(frame.raw) == _RTU_EXCEPTION and not frame.function & EXCEPTION
+    def _expect_counted(self, start: _Start, head: int, count: int) -> None:
+        """Expect the frames with this byte count at the end of their head."""
+        length = head + count + _RTU_CHECKSUM
+        possible = count > 0 and count % 2 == 0 and length <= _RTU_LONGEST
+        if possible:
+            self._expect_frame(start, _COUNTED_RANK, length)
+        if head == _RTU_READ_HEAD:
+            # A request to read a register at 0x04xx, or a reply of two words without
+            # its last byte: if that is 00, both checksums are good. No charger has
+            # such a register (PROTOCOLS.md, 3), so this waits for the byte.
+            waits = possible and length == _RTU_FIXED + 1
+            self._expect_frame(start, _FIXED_RANK, _RTU_FIXED, waits=waits)
 
+    def _expect_frame(
+        self, start: _Start, rank: int, length: int, *, waits: bool = False
+    ) -> None:
+        end = start.at + length
+        start.open_until = max(start.open_until, end)
+        self._due.setdefault(end + waits, []).append((start, rank, length))
 
-def _rtu_lengths(buffer: bytes, start: int) -> tuple[int, ...]:
-    """Return the possible lengths of a frame that starts here; none: no start.
+    def _checked(self) -> Iterator[_Start]:
+        """Check the frames that end here; yield the starts of good ones, if sure."""
+        for start, rank, length in self._due.pop(self._dropped + len(self._buffer), ()):
+            at = start.at - self._dropped
+            if at < 0 or (start.length and start.rank < rank):
+                continue
+            if self._crc.is_good(at, at + length):
+                start.rank, start.length = rank, length
+                if rank != _EXCEPTION_RANK or self._buffer[at + 1] & EXCEPTION:
+                    yield start
 
-    Before the bytes that decide it have arrived: the shortest frame with them.
-    """
-    if start + 1 == len(buffer):
-        return (_RTU_EXCEPTION,)
-    function = buffer[start + 1]
-    if function & ~EXCEPTION not in _KNOWN:
-        return ()
-    if function & EXCEPTION:
-        return (_RTU_EXCEPTION,)
-    counted = _rtu_counted(function, buffer[start : start + _RTU_FIXED])
-    if counted == (_RTU_FIXED + 1,) and len(buffer) - start == _RTU_FIXED:
-        # A request to read a register at 0x04xx, or a reply of two words without its
-        # last byte: if that is 00, both checksums are good. No charger has such a
-        # register (PROTOCOLS.md, 3), so this waits for the byte.
-        return (*counted, _RTU_EXCEPTION)
-    return (*counted, _RTU_FIXED, _RTU_EXCEPTION)
+    def _take(self, sure: Iterable[_Start]) -> Iterator[ModbusFrame]:
+        """Yield the frames; what can belong to none is lost.
 
-
-def _rtu_counted(function: int, head: bytes) -> tuple[int, ...]:
-    """Return the length of a frame with a byte count, if this can be one."""
-    if function in _READS:
-        before, count = _RTU_READ_HEAD, head[_RTU_READ_HEAD - 1 : _RTU_READ_HEAD]
-    elif function == WRITE_MULTIPLE_REGISTERS:
-        before, count = _RTU_WRITE_HEAD, head[_RTU_WRITE_HEAD - 1 : _RTU_WRITE_HEAD]
-    else:
-        return ()
-    length = before + sum(count) + _RTU_CHECKSUM
-    possible = sum(count) > 0 and sum(count) % 2 == 0 and length <= _RTU_LONGEST
-    return (length,) if possible else ()
-
-
-def _rtu_decode(
-    buffer: bytes, start: int, lengths: tuple[int, ...]
-) -> ModbusFrame | None:
-    """Return the complete frame that starts here; ``None``: there is none."""
-    for length in lengths:
-        raw = buffer[start : start + length]
-        if len(raw) == length and crc(raw[:-_RTU_CHECKSUM]) == raw[-_RTU_CHECKSUM:]:
-            return ModbusFrame(
+        ``sure``: the frames that are believed inside an unfinished one, too. Others
+        have only a checksum as evidence, and may be the contents of that one.
+        """
+        inside = deque(sure)
+        end = self._dropped + len(self._buffer)
+        taken = at = 0
+        while at < len(self._buffer):
+            start = self._starts[at]
+            if not start.length:
+                if start.open_until <= end:
+                    at += 1
+                    continue
+                while inside and inside[0].at < start.at:
+                    inside.popleft()
+                if not inside:
+                    break
+                start = inside[0]
+                at = start.at - self._dropped
+            self._lose(at - taken)
+            taken = at + start.length
+            raw = bytes(self._buffer[at:taken])
+            at = taken
+            yield ModbusFrame(
                 raw=raw,
                 is_reply=None,
                 unit=raw[0],
                 function=raw[1],
                 data=raw[2:-_RTU_CHECKSUM],
             )
-    return None
+        self._lose(at - taken)
+        self._drop(at)
+
+    def _lose(self, count: int) -> None:
+        """Count bytes that belong to no frame."""
+        self.noise += count
+        self.bad += count >= _RTU_EXCEPTION
+
+    def _drop(self, count: int) -> None:
+        """Drop bytes from the front of the buffer."""
+        del self._buffer[:count]
+        del self._starts[:count]
+        self._crc.drop(count)
+        self._dropped += count

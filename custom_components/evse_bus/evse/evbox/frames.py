@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import reduce
 from operator import xor
+import re
 from string import hexdigits
 from typing import Final, Literal, override
 
@@ -241,6 +242,9 @@ def decode_reply(received: EvboxFrame) -> Reply | None:
 # -- Finding frames ----------------------------------------------------------------
 
 
+_MARK: Final = re.compile(bytes((ord("["), STX, ETX, ord("]"))))
+
+
 class EvboxFramer(Framer[EvboxFrame]):
     """Finds frames; real boxes may begin a new one (STX) before the ETX of the last."""
 
@@ -258,48 +262,42 @@ class EvboxFramer(Framer[EvboxFrame]):
     @override
     def reset(self) -> None:
         """Drop an unfinished frame; its bytes count as noise."""
-        self._drop(len(self._buffer))
+        self.noise += len(self._buffer)
+        self._buffer.clear()
 
     @override
     def feed(self, data: bytes) -> list[EvboxFrame]:
         """Return the whole frames that end within these bytes."""
-        buffer = self._buffer
-        buffer += data
         found: list[EvboxFrame] = []
-        while (start := buffer.find(STX)) >= 0:
-            self._drop(start)
-            end = buffer.find(ETX)
-            # An unfinished frame before a new one is lost.
-            restart = buffer.find(STX, 1, end if end >= 0 else len(buffer))
-            if restart > 0:
-                self._overlong(restart)
-                self._drop(restart)
-            elif end >= 0:
-                self._overlong(end + 1)
-                self._end(end + 1, found)
+        at = 0
+        for mark in _MARK.finditer(data):
+            self._go_on(data[at : mark.start()])
+            at = mark.end()
+            if mark[0][0] == STX:
+                # An unfinished frame before a new one is lost.
+                self.reset()
+                self._buffer.append(STX)
             else:
-                if self._overlong(len(buffer)):
-                    self._drop(len(buffer))
-                return found
-        self._drop(len(buffer))
+                self._go_on(mark[0])
+                self._end(found)
+        self._go_on(data[at:])
         return found
 
-    def _drop(self, count: int) -> None:
-        self.noise += count
-        del self._buffer[:count]
-
-    def _overlong(self, length: int) -> bool:
-        if length <= LONGEST_FRAME:
-            return False
-        self.bad += 1
-        return True
-
-    def _end(self, length: int, found: list[EvboxFrame]) -> None:
-        if length > LONGEST_FRAME:
-            self._drop(length)
+    def _go_on(self, data: bytes) -> None:
+        """Go on with the frame that has begun, if there is one."""
+        if not self._buffer:
+            self.noise += len(data)
             return
-        raw = bytes(self._buffer[:length])
-        del self._buffer[:length]
+        self._buffer += data
+        if len(self._buffer) > LONGEST_FRAME:
+            self.bad += 1
+            self.reset()
+
+    def _end(self, found: list[EvboxFrame]) -> None:
+        if not self._buffer:
+            return
+        raw = bytes(self._buffer)
+        self._buffer.clear()
         text = _checked(raw[1:-1])
         if text is None:
             self.bad += 1

@@ -1,0 +1,97 @@
+"""Framers and hostile bytes: what is kept is bounded, and each byte costs as much.
+
+Work is counted in instructions, and the search for costly bytes is led by that count.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from hypothesis import given, settings, strategies as st, target
+import pytest
+
+from custom_components.evse_bus.evse.evbox.frames import (
+    LONGEST_FRAME as LONGEST_EVBOX,
+    EvboxFramer,
+)
+from custom_components.evse_bus.evse.framing import Frame, Framer
+from custom_components.evse_bus.evse.modbus import AsciiFramer, RtuFramer
+
+from .work import instructions
+
+STREAM = 1500
+"""Bytes of one stream; more than any framer keeps."""
+SIZES = (1, 5, 64, STREAM)
+"""Bytes fed at once."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A framer, bytes that mean something to it, and its bounds."""
+
+    make: Callable[[], Framer[Frame]]
+    pieces: Sequence[bytes]
+    most_work: int
+    """Instructions per byte; about twice the worst that a long search has found."""
+    most_kept: int
+
+
+def _bytes(text: str) -> list[bytes]:
+    return [bytes((byte,)) for byte in bytes.fromhex(text)]
+
+
+KINDS = {
+    "rtu": Kind(RtuFramer, _bytes("00 01 03 04 06 10 83 fa f6 f8 08 02 20"), 1500, 256),
+    "ascii": Kind(
+        AsciiFramer,
+        [b":", b">", b"\r", b"\n", b"\r\n", b"0", b"A", b"x", b"0" * 20, b"0" * 255],
+        250,
+        512,
+    ),
+    "evbox": Kind(
+        EvboxFramer,
+        [b"\x02", b"\x03", b"0", b"A08069", b"80A069", b"\xff", b"0" * 100, b"F" * 495],
+        350,
+        LONGEST_EVBOX,
+    ),
+}
+
+
+def work_per_byte(kind: Kind, pattern: bytes, size: int) -> float:
+    """Feed a repeated pattern; return the work per byte."""
+    stream = (pattern * (STREAM // len(pattern) + 1))[:STREAM]
+    framer = kind.make()
+
+    def feed() -> None:
+        for at in range(0, STREAM, size):
+            framer.feed(stream[at : at + size])
+
+    work = instructions(feed, kind.most_work * STREAM)
+    assert framer.pending <= kind.most_kept
+    return work / STREAM
+
+
+@pytest.mark.parametrize("name", KINDS)
+@settings(max_examples=60)
+@given(st.data())
+def test_no_bytes_are_costly(name: str, data: st.DataObject) -> None:
+    kind = KINDS[name]
+    pieces = st.lists(st.sampled_from(kind.pieces), min_size=1, max_size=12)
+    size = data.draw(st.sampled_from(SIZES))
+    target(work_per_byte(kind, b"".join(data.draw(pieces)), size))
+
+
+COSTLY = {
+    "rtu": ["fa10f804f6", "fa04f8", "10f6", "04", "0404fa", "04048310"],
+    "ascii": ["3a3e", "3a" + "30" * 600, "3a300d", "3a0d0a"],
+    "evbox": ["02", "0203", "02" + "30" * 988, "02" + "30" * 2000 + "03"],
+}
+"""The worst that a long search has found, for these framers and earlier ones."""
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize(
+    ("name", "pattern"), [(name, one) for name in COSTLY for one in COSTLY[name]]
+)
+def test_patterns_that_were_costly(name: str, pattern: str, size: int) -> None:
+    """The first, in single bytes, cost 74,000 instructions a byte."""
+    work_per_byte(KINDS[name], bytes.fromhex(pattern), size)
