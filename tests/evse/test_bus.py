@@ -634,3 +634,31 @@ def test_a_port_that_cannot_be_opened_is_told_at_the_start() -> None:
         await bus.bus.stop()
 
     simulate(scene())
+
+
+def test_all_replies_to_one_request_are_collected() -> None:
+    async def scene() -> None:
+        async with Scene(addresses=(1,), interval=60.0) as bus:
+            await asyncio.sleep(5)
+            charger = bus.charger(1)
+
+            async def conversation(turn: Turn) -> list[int]:
+                return await turn.collect(b"@\x01R\x00", charger._accept("R"))
+
+            begun = now()
+            assert await charger.run(conversation) == [0]
+            # No reply ends the exchange, and it is no time-out.
+            assert now() - begun >= TIMING.reply_timeout
+            assert bus.bus.wire.statistics.timeouts == 0
+            reply = bytes((ord("@"), 1, ord("R"), 7))
+            bus.line.on_sent = lambda _sent: bus.line.deliver(reply, now() + 0.1)
+            assert await charger.run(conversation) == [0, 7]
+            bus.line.on_sent = lambda _sent: bus.line.deliver(b"\xff", now() + 0.1)
+            with pytest.raises(GarbledReplyError):
+                await charger.run(conversation)
+            bus.line.on_sent = lambda _sent: None
+            bus.line.devices.pop(1)
+            with pytest.raises(ReplyTimeoutError):
+                await charger.run(conversation)
+
+    simulate(scene())

@@ -30,6 +30,21 @@ type Request = bytes | Callable[[], bytes]
 """Bytes to send, or a function that returns them, called right before they are sent."""
 
 
+class AllReplies[F: Frame, T]:
+    """Accepts a reply as another function does; none of them ends the exchange."""
+
+    def __init__(self, accept: Callable[[F], T | None]) -> None:
+        """``accept`` returns ``None`` for a frame that is no reply."""
+        self._accept = accept
+        self.replies: list[T] = []
+
+    def __call__(self, frame: F) -> T | None:
+        """Keep the reply and return it."""
+        if (reply := self._accept(frame)) is not None:
+            self.replies.append(reply)
+        return reply
+
+
 class Wire:
     """A line with frames on it; one exchange at a time."""
 
@@ -117,9 +132,7 @@ class Wire:
                 self.recovery.unanswered(loop.time())
             self._unanswered = _Unanswered(accept, sent, loop.time())
             self._framer.reset()
-            unreadable = self._framer.bad - bad
-            if unreadable or self._framer.noise > noise:
-                counted.bad_frames += max(unreadable, 1)
+            if self._is_disturbed(bad, noise, counted):
                 message = "a reply came, but it could not be read"
                 raise GarbledReplyError(message) from error
             raise
@@ -136,7 +149,19 @@ class Wire:
             # Lost together with the reply: the conversation must not go on.
             message = f"{self.line.url} was lost"
             raise LineLostError(message)
+        if isinstance(accept, AllReplies):
+            self._framer.reset()
+            if self._is_disturbed(bad, noise, counted):
+                raise GarbledReplyError("unreadable bytes came beside a reply")
         return result  # type: ignore[return-value] # accept's own type
+
+    def _is_disturbed(self, bad: int, noise: int, counted: ChargerStatistics) -> bool:
+        """Return whether unreadable bytes came since these counts, and count them."""
+        unreadable = self._framer.bad - bad
+        if not unreadable and self._framer.noise == noise:
+            return False
+        counted.bad_frames += max(unreadable, 1)
+        return True
 
     async def send(self, request: Request) -> float:
         """Send without waiting for a reply (see `Turn.send`)."""
@@ -287,6 +312,19 @@ class Turn:
             patience=patience,
         )
 
+    async def collect[F: Frame, T](
+        self, request: Request, accept: Callable[[F], T | None]
+    ) -> list[T]:
+        """Send a request and return all replies that come within the reply time-out.
+
+        No reply ends the exchange: that of a second, slower charger is among them, and
+        cannot fall into the next exchange. Raises GarbledReplyError also where
+        unreadable bytes came beside a reply, else as `exchange`.
+        """
+        collector = AllReplies(accept)
+        await self._wire.exchange(request, collector, self._counted)
+        return collector.replies
+
     async def send(self, request: Request) -> float:
         """Send without waiting for a reply; return the loop time of the end, s.
 
@@ -345,8 +383,10 @@ class _PendingReply:
         else:
             if result is None:
                 return False
-            self.future.set_result(result)
-        self.answered_at = self._loop.time()
+            if not isinstance(self._accept, AllReplies):
+                self.future.set_result(result)
+        if self.answered_at is None:
+            self.answered_at = self._loop.time()
         return True
 
     def extend(self) -> None:
@@ -366,7 +406,10 @@ class _PendingReply:
         if until > self._loop.time():
             self._timer = self._loop.call_at(until, self._time_is_up)
             return
-        self.future.set_exception(ReplyTimeoutError("no reply in time"))
+        if isinstance(self._accept, AllReplies) and self._accept.replies:
+            self.future.set_result(self._accept.replies[0])
+        else:
+            self.future.set_exception(ReplyTimeoutError("no reply in time"))
 
     def close(self) -> None:
         """Leave no timer behind."""

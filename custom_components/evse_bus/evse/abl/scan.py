@@ -9,20 +9,17 @@ from typing import Final
 from ..bus import Bus
 from ..errors import GarbledReplyError, LineBusyError, ReplyTimeoutError
 from ..exchange import Turn
-from ..modbus import ModbusFrame
 from ..model import ChargerConfig, Orders
 from ..protocol import Progress
 from ..readings import ChargerInfo
-from ..registers import Registers
 from ..scan import FoundCharger, ScanResult
+from .collect import collect
 from .readings import charger_info
 from .registers import (
     ADDRESSES,
     INFO,
     SERIAL,
     Serial,
-    read_answer,
-    read_request,
 )
 
 ATTEMPTS: Final = 2
@@ -112,7 +109,7 @@ async def _read_info(address: int, turn: Turn) -> ChargerInfo:
     differ: that reply is then unreadable, or there are two. Raises GarbledReplyError
     in both cases.
     """
-    infos = await _collect(turn, address, INFO)
+    infos = await collect(turn, address, INFO)
     serials = {serial.number for serial in await _read_serials(turn, address)}
     if len(infos) > 1 or len(serials) > 1:
         message = f"several replies from device-ID {address}: {len(serials)} serials"
@@ -128,40 +125,13 @@ async def _read_serials(turn: Turn, address: int) -> list[Serial]:
     """
     for attempt in range(ATTEMPTS):
         try:
-            return await _collect(turn, address, SERIAL, disturbed=False)
+            return await collect(turn, address, SERIAL, disturbed=False)
         except GarbledReplyError:
             if attempt + 1 == ATTEMPTS:
                 raise
         except ReplyTimeoutError:
             pass
     return []
-
-
-async def _collect[T](
-    turn: Turn, address: int, registers: Registers[T], *, disturbed: bool = True
-) -> list[T]:
-    """Return all replies to one read: no reply ends the exchange.
-
-    So that of a second, slower box is among them, and cannot fall into the next
-    exchange. ``disturbed``: unreadable bytes beside a reply are allowed (a box that
-    wakes up). Raises ReplyTimeoutError where there is none, and GarbledReplyError.
-    """
-    replies: list[T] = []
-    answer = read_answer(address, registers.block)
-
-    def collect(frame: ModbusFrame) -> None:
-        if (data := answer(frame)) is not None:
-            replies.append(registers.decode(data))
-
-    try:
-        await turn.exchange(read_request(address, registers.block), collect)
-    except GarbledReplyError:
-        if not (replies and disturbed):
-            raise
-    except ReplyTimeoutError:
-        if not replies:
-            raise
-    return replies
 
 
 async def scan(
