@@ -9,7 +9,6 @@ from typing import Final
 
 from . import (
     abl_scan,
-    byte_errors,
     evbox_bus,
     ews_events,
     ews_listener,
@@ -37,7 +36,6 @@ BENCHMARKS: Final = {
         ews_poll,
         ews_events,
         ews_listener,
-        byte_errors,
     )
 }
 

@@ -57,13 +57,11 @@ class Segment:
     data: bytes
     sources: tuple[str, ...]
     silence_before: float
-    lasts: float = 0.0
-    """How long the wire was in use, s; 0: for the time of its bytes."""
 
     @property
     def end(self) -> float:
         """Return the end of the last byte."""
-        return self.start + (self.lasts or len(self.data) * self.byte_time)
+        return self.start + len(self.data) * self.byte_time
 
 
 class Wire:
@@ -232,11 +230,11 @@ class Wire:
             complete = min(complete, alone)
         start = first.next_start
         if complete > 0:
-            sent = first.data[first.position : first.position + complete]
+            data = first.data[first.position : first.position + complete]
             first.position += complete
-            data = self.faults.disturb(sent, self._rng)
+            data = self.faults.disturb(data, self._rng)
             first.received += data
-            self._receive(start, data, (first.source,), complete * bt)
+            self._receive(start, data, (first.source,))
             return True
         self._collide(first, others, start)
         return True
@@ -262,28 +260,21 @@ class Wire:
                 transmission.collided = True
                 self.collisions += 1
         sources = tuple(sorted({t.source for t in together}))
-        self._receive(start, bytes((value,)), sources, first.byte_time)
+        self._receive(start, bytes((value,)), sources)
 
-    def _receive(
-        self, start: float, data: bytes, sources: tuple[str, ...], lasts: float
-    ) -> None:
-        """Receive bytes for which the wire was in use so long, s.
-
-        A byte error may have removed bytes, or added some.
-        """
+    def _receive(self, start: float, data: bytes, sources: tuple[str, ...]) -> None:
         silence = start - self._last_end
         # On two wires the other direction may already be further.
-        self._last_end = max(self._last_end, start + lasts)
+        self._last_end = max(self._last_end, start + len(data) * self.byte_time)
         self.bytes_carried += len(data)
         if sources != (CLIENT,) or self.faults.echo:
             self._to_client += data
         last = self._segments[-1] if self._segments else None
         if last is not None and last.sources == sources and silence < EPSILON:
             last.data += data
-            last.lasts += lasts
-        elif data:
+        else:
             self._segments.append(
-                Segment(start, self.byte_time, data, sources, silence, lasts)
+                Segment(start, self.byte_time, data, sources, silence)
             )
 
     def _log(self, transmission: Transmission) -> None:

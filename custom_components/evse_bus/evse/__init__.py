@@ -4,6 +4,12 @@ A library of its own: it imports nothing of Home Assistant. The names below are 
 script needs; docs/library.md has examples.
 """
 
+from .address_change import (
+    AddressChange,
+    AddressChanged,
+    AddressChangeError,
+    Problem,
+)
 from .bus import Bus
 from .charger import Charger
 from .conversation import rest
@@ -53,6 +59,9 @@ from .scan import FoundCharger, ScanResult
 
 __all__ = [
     "PROTOCOLS",
+    "AddressChange",
+    "AddressChangeError",
+    "AddressChanged",
     "Bus",
     "Capability",
     "Charger",
@@ -85,6 +94,7 @@ __all__ = [
     "PortMissingError",
     "PortPermissionError",
     "PortSettingsError",
+    "Problem",
     "Protocol",
     "RefusedOrderError",
     "ReplyTimeoutError",

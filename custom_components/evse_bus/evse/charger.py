@@ -319,6 +319,7 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
     def move(self, address: int) -> None:
         """Follow a charger to another address on the bus."""
         self._config = replace(self._config, address=address)
+        self.updated()
 
     @property
     def busy(self) -> bool:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from .address import AddressForm
+from .address_change import AddressChange, AddressChanged
 from .bus import Bus
 from .charger import Charger
 from .dialling import Listener, ListenerFactory, Network, UnknownBoxCallback
@@ -23,6 +24,8 @@ from .scan import ScanResult
 
 type Progress = Callable[[float], None]
 """Called with the share of a scan that is done, 0..1."""
+type ChangeAddress = Callable[[Bus, AddressChange, Progress], Awaitable[AddressChanged]]
+"""Changes the address of a charger on a started bus."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,6 +79,11 @@ class Protocol[C: ChargerConfig = Any]:
     """Search for chargers on a started bus: ``scan(bus, config, orders, progress)``.
 
     ``config`` and ``orders`` are sent where `probe_sets_limits` is true.
+    """
+    change_address: ChangeAddress | None = None
+    """Gives the charger at an address another one; ``None``: that is set at the charger.
+
+    It raises AddressChangeError, and what `Bus.run` raises while nothing is written.
     """
     interface: str = "RS-485"
     """Interface that the adapter needs."""

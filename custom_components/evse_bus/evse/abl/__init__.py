@@ -12,6 +12,7 @@ from ..protocol import Make, Protocol
 from ..redaction import SerialNumbers
 from .charger import AblCharger
 from .config import TIMING, AblConfig
+from .device_id import change_device_id
 from .scan import scan
 
 _PHASE_ORDER: Final = Choice(
@@ -38,6 +39,7 @@ PROTOCOL: Final = Protocol(
     config=AblConfig,
     charger=AblCharger,
     scan=scan,
+    change_address=change_device_id,
     address=NumberAddress(key="device_id", lowest=1, highest=16),
     options=(_PHASE_ORDER, Toggle(name="enable_again")),
     serials=_SERIALS,

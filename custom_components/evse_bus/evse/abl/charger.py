@@ -49,7 +49,6 @@ _CAPABILITIES: Final = frozenset(
         Capability.OUTLET_ENABLED,
         Capability.RESET,
         Capability.WAKE,
-        Capability.SET_ADDRESS,
     }
 )
 _WITH_METER: Final = frozenset(
@@ -134,7 +133,7 @@ class AblCharger(AblReader):
         if self.pending_cleanup is not None:
             if self.pending_cleanup.is_needed(status.state):
                 restoring = partial(restore, self)
-                return FollowUp(self._exclusive("restoring its state", restoring))
+                return FollowUp(self.exclusive("restoring its state", restoring))
             self.pending_cleanup = None
         if (decision := self.decide(now)) is None:
             return None
@@ -298,19 +297,19 @@ class AblCharger(AblReader):
         value: bool | int | str | None = None,
     ) -> None:
         conversation, persistence = conversation_for(self, command, value)
-        await self.run(self._exclusive(command, conversation), persistence=persistence)
+        await self.run(self.exclusive(command, conversation), persistence=persistence)
 
-    def _exclusive(self, name: str, conversation: Conversation) -> Conversation:
+    def exclusive[T](self, name: str, conversation: Conversation[T]) -> Conversation[T]:
         """Return a conversation that is refused while another command is under way."""
 
-        async def exclusive(turn: Turn) -> None:
+        async def exclusive(turn: Turn) -> T:
             if self._active is not None:
                 message = f"{self.config.name} is busy: {self._active.name}"
                 raise NotAvailableError(message)
             self._active = mine = _ActiveCommand(name)
             try:
                 with self.conversing():
-                    await conversation(turn)
+                    return await conversation(turn)
             finally:
                 if self._active is mine:
                     self._active = None

@@ -19,7 +19,7 @@ from ..exchange import Turn
 from ..model import Command, Persistence
 from .duty import PAUSE
 from .reader import AblReader, Cleanup
-from .registers import ADDRESSES, StateCode, limit_duty
+from .registers import StateCode, limit_duty
 from .settings import Settings, change_settings
 from .states import B2, E0, E2, state_of
 from .steps import disable, lower_limit, reach, reach_state, recover, refuse_in, restore
@@ -43,8 +43,6 @@ def conversation_for(
             outlet = _enable_outlet if enable else _disable_outlet
             # Either reads the state first, so a repeat changes nothing.
             return partial(outlet, reader), Persistence.REPEATABLE
-        case Command.SET_ADDRESS:
-            settings = Settings(device_id=_device_id(value))
         case Command.SET_UPSTREAM_TIMEOUT:
             settings = Settings(upstream_timeout=_on_or_off(command, value))
         case Command.SET_ENABLE_AFTER_POWER_CYCLE:
@@ -132,12 +130,5 @@ async def _reset(reader: AblReader, turn: Turn) -> None:
 def _on_or_off(command: Command, value: object) -> bool:
     if not isinstance(value, bool):
         message = f"{command} must be on or off, not {value!r}"
-        raise RefusedOrderError(message)
-    return value
-
-
-def _device_id(value: object) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or value not in ADDRESSES:
-        message = f"a device-ID is 1 to 16, not {value!r}"
         raise RefusedOrderError(message)
     return value

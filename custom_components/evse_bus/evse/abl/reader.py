@@ -625,15 +625,14 @@ class AblReader(Charger[AblConfig]):
     async def set_configuration(
         self,
         turn: Turn,
-        device_id: int,
         *,
         upstream_timeout: bool | None = None,
         needs_enable: bool | None = None,
     ) -> None:
-        """Write device-ID and settings (in E2); ``None``: no change."""
+        """Write settings (in E2); ``None``: no change."""
         request = write_configuration(
             self.config.address,
-            device_id,
+            self.config.address,
             upstream_timeout=upstream_timeout,
             needs_enable=needs_enable,
         )

@@ -1,4 +1,4 @@
-"""The box's own settings: device-ID, upstream time-out, enable after a power cycle.
+"""The box's own settings: upstream time-out, enable after a power cycle.
 
 Register 0x002C accepts them in state E2; they count after a reset and survive power
 cycles. The box must have been identified by its serial number (PROTOCOLS.md, 2).
@@ -7,23 +7,18 @@ cycles. The box must have been identified by its serial number (PROTOCOLS.md, 2)
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import Final
 
-from ..conversation import rest
 from ..errors import (
-    DuplicateAddressError,
     EvseError,
-    GarbledReplyError,
     NotAvailableError,
     NotConfirmedError,
     ReplyTimeoutError,
 )
 from ..exchange import Turn
-from .reader import AblReader, Cleanup, read
-from .registers import INFO, SERIAL, Reading, StateCode
+from .reader import AblReader, Cleanup
+from .registers import Reading, StateCode
 from .states import A1, E0, E2
 from .steps import (
-    BOOT_ATTEMPTS,
     hold_polls,
     reach,
     reach_state,
@@ -33,16 +28,11 @@ from .steps import (
     restore,
 )
 
-SILENT_READS: Final = 4
-"""Reads of a device-ID that prove it free: two pairs."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
     """A change of register 0x002C; ``None``: no change."""
 
-    device_id: int | None = None
-    """1 to 16."""
     upstream_timeout: bool | None = None
     needs_enable: bool | None = None
     """A plugged car must be enabled anew after a power cycle."""
@@ -52,40 +42,28 @@ async def change_settings(reader: AblReader, settings: Settings, turn: Turn) -> 
     """Write settings in E2, reset the box, and check that it has taken them.
 
     Raises NotAvailableError in a state without E2 and without a serial number,
-    DuplicateAddressError for a device-ID in use, NotConfirmedError.
+    NotConfirmedError.
     """
     before = await reach(reader, turn)
-    old = reader.config.address
-    new = old if settings.device_id is None else settings.device_id
-    if settings.device_id == old:
-        return
-    serial = _check_ready(reader, before)
-    if new != old and not await _is_free(reader, turn, new):
-        message = f"device-ID {new} is in use"
-        raise DuplicateAddressError(message)
+    _check_ready(reader, before)
     was_disabled = before.state == E0
     reader.pending_cleanup = (
         Cleanup(StateCode.E0) if was_disabled else Cleanup(StateCode.A1, E2)
     )
     try:
-        await _write(reader, turn, settings, new)
+        await _write(reader, turn, settings)
     except EvseError:
         # Leave E2 after any error.
         with suppress(EvseError):
             await restore(reader, turn)
         raise
-    if new != old:
-        await _follow(reader, turn, new, serial)
     await recover(reader, turn, was_disabled=was_disabled)
     await reader.read_flags(turn)
     _check_taken(reader, settings)
 
 
-def _check_ready(reader: AblReader, status: Reading) -> str:
-    """Return the serial number of a box whose settings can be changed now.
-
-    Raises NotAvailableError.
-    """
+def _check_ready(reader: AblReader, status: Reading) -> None:
+    """Raise NotAvailableError for a box whose settings cannot be changed now."""
     if status.state not in (A1, E0):
         why = "settings are changed in A1 or E0"
         raise refuse_in(reader, status, "abl_settings_state", why)
@@ -95,32 +73,9 @@ def _check_ready(reader: AblReader, status: Reading) -> str:
             "from another box with the same device-ID"
         )
         raise NotAvailableError(message, "abl_no_serial")
-    return reader.serial
 
 
-async def _is_free(reader: AblReader, turn: Turn, address: int) -> bool:
-    """Return whether a device-ID is not configured for another box, and silent."""
-    others = reader.bus.chargers.values() if reader.bus is not None else ()
-    if any(other.config.address == address for other in others):
-        return False
-    for attempt in range(SILENT_READS):
-        if attempt:
-            # A sleeping box loses the first request.
-            await rest(reader.pauses.retry)
-        try:
-            await read(turn, address, INFO)
-        except GarbledReplyError:
-            # Perhaps two boxes at once.
-            return False
-        except ReplyTimeoutError:
-            continue
-        return False
-    return True
-
-
-async def _write(
-    reader: AblReader, turn: Turn, settings: Settings, device_id: int
-) -> None:
+async def _write(reader: AblReader, turn: Turn, settings: Settings) -> None:
     """Go to E2, write the settings, and reset the box."""
     hold_polls(reader, turn)
     await reach_state(reader, turn, StateCode.E2, lambda now: now.state == E2)
@@ -128,7 +83,6 @@ async def _write(
     write = partial(
         reader.set_configuration,
         turn,
-        device_id,
         upstream_timeout=settings.upstream_timeout,
         needs_enable=settings.needs_enable,
     )
@@ -142,23 +96,6 @@ async def _write(
         with suppress(ReplyTimeoutError):
             if (await reader.read_status(turn)).state == E2:
                 await reader.set_state(turn, StateCode.RESET)
-
-
-async def _follow(reader: AblReader, turn: Turn, address: int, serial: str) -> None:
-    """Wait for the box at its new device-ID, known by its serial number."""
-    reader.invalidate()
-    for _ in range(BOOT_ATTEMPTS):
-        await rest_without_polls(reader, turn, reader.pauses.boot)
-        with suppress(ReplyTimeoutError):
-            found = await read(turn, address, SERIAL)
-            if found.number == serial:
-                reader.move(address)
-                return
-    message = (
-        f"{reader.config.name} was not found at device-ID {address}; "
-        f"it is still expected at {reader.config.address}"
-    )
-    raise NotConfirmedError(message)
 
 
 def _check_taken(reader: AblReader, settings: Settings) -> None:
