@@ -25,6 +25,8 @@ def instructions(function: Callable[[], object], most: int) -> int:
         nonlocal count
         count += 1
         if count > most:
+            # What follows, the end of the count included, is not counted.
+            monitoring.set_events(tool, 0)
             raise TooMuchWorkError(count)
 
     monitoring = sys.monitoring

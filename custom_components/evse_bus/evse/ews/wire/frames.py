@@ -5,9 +5,13 @@ is that of the parameters alone. The parameters of a command, of its answer and 
 info record begin with its name, two letters (manual, 3.2.2, 3.2.3).
 """
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field
 from enum import Enum, IntEnum, StrEnum
+from functools import reduce
+from heapq import heapify, heappop, heappush
+from itertools import accumulate
+from operator import xor
 from typing import ClassVar, Final, override
 
 from ...errors import RefusedOrderError
@@ -109,12 +113,7 @@ def checksum(content: bytes, bcc: Bcc) -> int:
     """Return the BCC of the bytes between STX and BCC."""
     if bcc is Bcc.WITHOUT_MESSAGE_ID:
         content = content[:2] + content[3:]
-    # Folded in halves, since garbage from a network may be long.
-    folded, left = int.from_bytes(content), len(content)
-    while left > 1:
-        left = (left + 1) // 2
-        folded = folded >> 8 * left ^ folded & (1 << 8 * left) - 1
-    return folded
+    return reduce(xor, content, 0)
 
 
 def encode(message_id: int, parameters: bytes, bcc: Bcc) -> bytes:
@@ -164,7 +163,10 @@ def redacted(raw: bytes) -> bytes:
     A known message that is not private is kept whole; of a private one the head with
     its name is kept; of anything else only the length.
     """
-    if _Scan(raw, {}).whole(0) != raw or raw[3] not in _NAMED:
+    is_whole = _length(raw[:_HEAD]) == len(raw) <= LONGEST_FRAME
+    if not is_whole or raw[3] not in _NAMED or _INFO_HEAD[:_SURE] in raw[1:]:
+        return bytes(len(raw))
+    if _bcc(reduce(xor, raw[1:]), raw[3]) is None:
         return bytes(len(raw))
     head = raw[:_HEAD]
     return head + bytes(len(raw) - _HEAD) if head[4:] in _PRIVATE_NAMES else raw
@@ -179,6 +181,10 @@ _SURE: Final = 4
 """So many bytes of its head do not occur in another message by chance."""
 _LONGEST_KEPT: Final = LONGEST_FRAME + _INFO_LENGTH
 """The longest message with the beginning of an info record inside it, bytes."""
+_MOST_RECORDS: Final = 3
+_NAMES: Final = frozenset(command.encode() for command in CommandId)
+_TRUSTED_INSIDE: Final = (MessageId.ANSWER, MessageId.COMMAND)
+"""Messages that are believed inside an incomplete one, if a command has their name."""
 
 
 class EwsFramer(Framer[EwsFrame]):
@@ -188,21 +194,32 @@ class EwsFramer(Framer[EwsFrame]):
     it is taken out, and an answer or a command inside it shows that it will never be
     completed. Debug messages and those of applications are skipped whole.
 
-    Memory and time per byte are bounded, whatever comes: a message is given up when it
-    is longer than any, and the kept bytes are searched again only when a message among
-    them may be complete.
+    Memory and time per byte are bounded, whatever comes. A message is given up when it
+    is longer than any; each possible one is looked at when its head is complete, when
+    its last byte has arrived, and when no other before it is left. Any part's checksum
+    follows from two of those that run on through all bytes.
     """
 
     unsolicited: ClassVar = True
 
+    # Places count from the first byte ever, without the info records taken out.
+
     def __init__(self) -> None:
         """Start empty."""
         super().__init__()
-        self._buffer = b""
-        self._search_at = 0
-        """Length of the buffer from which on a search may find something new."""
-        self._checksums: dict[int, Bcc | None] = {}
-        """Kinds of checksum of complete messages, by their place in the buffer."""
+        self._buffer = bytearray()
+        self._sums = bytearray(1)
+        """XOR of all bytes before each one of the buffer, and of all."""
+        self._dropped = 0
+        """Place of the first byte of the buffer."""
+        self._records: list[int] = []
+        """Where info records begin, ascending: incomplete, or with one inside."""
+        self._noted = 0
+        """Places before this one are noted in `_ends`, if a trusted message begins."""
+        self._ends: list[tuple[int, int]] = []
+        """Heap of possible trusted messages: where they end and begin."""
+        self._inside: list[int] = []
+        """Heap of the good ones among them: where they begin."""
 
     @property
     @override
@@ -222,152 +239,215 @@ class EwsFramer(Framer[EwsFrame]):
     def feed(self, data: bytes) -> list[EwsFrame]:
         found: list[EwsFrame] = []
         for at in range(0, len(data), LONGEST_FRAME):
-            received = len(self._buffer)
-            self._buffer += data[at : at + LONGEST_FRAME]
-            if (begins := self._buffer.find(STX_BYTE, received)) >= 0:
-                self._search_at = min(self._search_at, begins + _HEAD - 2)
-            if len(self._buffer) >= self._search_at:
-                found += self._search()
+            self._receive(data[at : at + LONGEST_FRAME], found)
+            self._decide(found)
         return found
 
-    def _search(self) -> list[EwsFrame]:
-        scan = _Scan(self._buffer, self._checksums)
-        found: list[EwsFrame] = []
-        taken = at = 0
-        begun: int | None = None
-        while (at := scan.buffer.find(STX_BYTE, at)) >= 0:
-            whole = scan.whole(at)
-            if whole is None:
-                if begun is None:
-                    if scan.may_end(at):
-                        begun = at
-                    else:
-                        self.bad += _length(scan.buffer[at : at + _HEAD]) is not None
-                at += 1
-                continue
-            frame = _frame(whole)
-            if begun is not None:
-                if frame is None or frame.name not in _TRUSTED_INSIDE:
-                    at += 1
-                    continue
-                if frame.message_id is MessageId.INFO:
-                    found.append(frame)
-                    rest = scan.buffer[:at] + scan.buffer[at + len(whole) :]
-                    scan = _Scan(rest, {})
-                    at, begun = begun, None
-                    continue
-                self.bad += 1
-                begun = None
-            if frame is not None:
-                found.append(frame)
-            self.noise += at - taken
-            taken = at = at + len(whole)
-        kept = len(scan.buffer) if begun is None else begun
-        self.noise += kept - taken
-        self._buffer = scan.buffer
-        self._checksums = scan.checksums
-        self._search_at = 0 if begun is None else scan.changes_at(kept)
-        self._drop(kept)
-        return found
+    # -- Info records ----------------------------------------------------------------
 
-    def _drop(self, length: int) -> None:
-        """Drop bytes from the front of the buffer."""
-        self._buffer = self._buffer[length:]
-        self._search_at = max(self._search_at - length, 0)
-        self._checksums = {
-            at - length: bcc for at, bcc in self._checksums.items() if at >= length
-        }
-
-
-_TRUSTED_INSIDE: Final = frozenset({"if", *CommandId})
-"""Names that are accepted inside a possible other message."""
-
-
-class _Scan:
-    """One search through the kept bytes."""
-
-    def __init__(self, buffer: bytes, checksums: dict[int, Bcc | None]) -> None:
-        """``checksums`` are those that earlier searches have computed."""
-        self.buffer = buffer
-        self.checksums = checksums
-        self._records = self._find_records()
-        """Where good or incomplete info records begin, ascending."""
-        self._partial = [
-            len(buffer) - length
-            for length in range(_HEAD - 1, 0, -1)
-            if buffer.endswith(_INFO_HEAD[:length])
-        ]
-        """Where the head of an info record may begin at the end, ascending."""
-
-    def whole(self, at: int) -> bytes | None:
-        """Return the good message that begins here, if it is complete."""
-        length = _length(self.buffer[at : at + _HEAD])
-        if length is None or length > min(LONGEST_FRAME, len(self.buffer) - at):
-            return None
-        # With an info record inside, its checksum is right by chance only.
-        if self._bcc(at, length) is None or self._record_inside(at, length, _SURE):
-            return None
-        return self.buffer[at : at + length]
-
-    def may_end(self, at: int) -> bool:
-        """Return whether a good message may begin here."""
-        length = _length(self.buffer[at : at + _HEAD])
-        received = len(self.buffer) - at
-        if length is not None and received < length <= LONGEST_FRAME:
-            return True
-        if received > _LONGEST_KEPT:
-            return False
-        # It seems broken, but may be good except for an info record inside it.
-        inside = _HEAD if length is None else min(length, LONGEST_FRAME)
-        return self._record_inside(at, inside, 1)
-
-    def changes_at(self, start: int) -> int:
-        """Return the length of the buffer at which a next search may differ.
-
-        ``start``: the bytes before it are dropped.
-        """
-        length = len(self.buffer)
-        if self._partial and self._partial[-1] >= start:
-            return length + 1
-        nearest = start + _LONGEST_KEPT + 1
-        at = start
-        while (at := self.buffer.find(STX_BYTE, at)) >= 0:
-            whole = _length(self.buffer[at : at + _HEAD])
-            if whole is not None:
-                # The message-id, then each letter of the name, may rule a head out.
-                for end in (at + 4, at + 5, at + _HEAD, at + whole):
-                    if length < end < nearest:
-                        nearest = end
+    def _receive(self, data: bytes, found: list[EwsFrame]) -> None:
+        """Append bytes, and take info records out."""
+        at = 0
+        while at < len(data):
+            if not self._records:
+                stx = data.find(STX_BYTE, at)
+                end = len(data) if stx < 0 else stx
+                self._append(data[at:end])
+                at = end
+            self._append(data[at : at + 1])
             at += 1
-        return nearest
+            self._follow_records(found)
 
-    def _bcc(self, at: int, length: int) -> Bcc | None:
-        if at not in self.checksums:
-            self.checksums[at] = _bcc(self.buffer[at : at + length])
-        return self.checksums[at]
+    def _append(self, data: bytes) -> None:
+        self._buffer += data
+        self._sums += bytes(accumulate(data, xor, initial=self._sums.pop()))
 
-    def _find_records(self) -> list[int]:
-        found: list[int] = []
-        at = -1
-        while (at := self.buffer.find(_INFO_HEAD, at + 1)) >= 0:
-            incomplete = len(self.buffer) - at < _INFO_LENGTH
-            if incomplete or self._bcc(at, _INFO_LENGTH) is not None:
-                found.append(at)
-        return found
+    def _follow_records(self, found: list[EwsFrame]) -> None:
+        """Look what the last byte makes of info records that have begun."""
+        records, end = self._records, self._end
+        length = end - records[-1] if records else 0
+        if 0 < length <= _HEAD and self._buffer[-1] != _INFO_HEAD[length - 1]:
+            records.pop()
+        if self._buffer[-1] == STX:
+            records.append(end - 1)
+            # More than a few, each inside the one before it, are none.
+            del records[:-_MOST_RECORDS]
+        ended = end - _INFO_LENGTH
+        if ended in records and self._bcc(ended, _INFO_LENGTH) is None:
+            records.remove(ended)
+        while records:
+            # The last one may be the end of a record before it.
+            last = records[-1]
+            if self._end - last < _SURE and len(records) > 1:
+                last = records[-2]
+            if self._end - last < _INFO_LENGTH:
+                return
+            self._take_out(last, found)
 
-    def _record_inside(self, at: int, length: int, least: int) -> bool:
-        """Return whether a good info record begins inside a message.
+    def _take_out(self, record: int, found: list[EwsFrame]) -> None:
+        """Take a good info record out: what surrounds it is joined."""
+        at = record - self._dropped
+        frame = self._frame(record, _INFO_LENGTH)
+        behind = bytes(self._buffer[at + _INFO_LENGTH :])
+        del self._buffer[at:]
+        del self._sums[at + 1 :]
+        # One that had begun may go on behind it.
+        begins = max(record - _INFO_LENGTH + 1, self._dropped)
+        del self._records[bisect_left(self._records, begins) :]
+        begin = self._find(begins)
+        while begin is not None:
+            if _INFO_HEAD.startswith(self._head(begin)):
+                self._records.append(begin)
+            begin = self._find(begin + 1)
+        if self._noted > begins:
+            self._noted = begins
+            self._ends = [one for one in self._ends if one[1] < begins]
+            heapify(self._ends)
+        self._decide(found)
+        if frame is not None:
+            found.append(frame)
+        self._receive(behind, found)
+
+    def _record_inside(self, begin: int, end: int, least: int) -> bool:
+        """Return whether an info record begins inside a message.
 
         ``least``: the bytes of it that must have been received.
         """
-        end = at + length
-        first = bisect_right(self._records, at)
-        if first < len(self._records) and self._records[first] < end:
-            return True
-        received = len(self.buffer)
-        return any(
-            at < inside < end and received - inside >= least for inside in self._partial
+        place = bisect_right(self._records, begin)
+        return place < len(self._records) and (
+            self._records[place] < end and self._end - self._records[place] >= least
         )
+
+    # -- Messages --------------------------------------------------------------------
+
+    def _decide(self, found: list[EwsFrame]) -> None:
+        """Take the complete messages out, and drop what belongs to none."""
+        taken = at = self._dropped
+        while (begin := self._find(at)) is not None:
+            at = begin
+            good = self._is_good(at)
+            if good is False:
+                self.bad += self._length(at) is not None
+                at += 1
+                continue
+            if good is None:
+                inside = self._find_inside(at)
+                if inside is None:
+                    break
+                self.bad += 1
+                at = inside
+            self.noise += at - taken
+            length = self._length(at) or 0
+            if (frame := self._frame(at, length)) is not None:
+                found.append(frame)
+            taken = at = at + length
+        else:
+            at = self._end
+        self.noise += at - taken
+        self._drop(at - self._dropped)
+
+    def _is_good(self, at: int) -> bool | None:
+        """Return whether a good message begins here; ``None``: it may, later."""
+        length = self._length(at)
+        received = self._end - at
+        if length is not None and length <= LONGEST_FRAME:
+            if received < length:
+                return None
+            # With an info record inside, its checksum is right by chance only.
+            if not self._record_inside(at, at + length, _SURE) and self._bcc(
+                at, length
+            ):
+                return True
+        # It seems broken, but may be good except for an info record inside it.
+        end = at + (_HEAD if length is None else min(length, LONGEST_FRAME))
+        waits = received <= _LONGEST_KEPT and self._record_inside(at, end, 1)
+        return None if waits else False
+
+    def _find_inside(self, outer: int) -> int | None:
+        """Return where the first good and trusted message inside another begins."""
+        self._note(outer)
+        # The others have an info record inside, or seem to.
+        limit = self._records[0] if self._records else self._end
+        while self._ends and self._ends[0][0] <= limit:
+            end, at = heappop(self._ends)
+            if at > outer and self._bcc(at, end - at):
+                heappush(self._inside, at)
+        while self._inside and self._inside[0] <= outer:
+            heappop(self._inside)
+        if self._inside:
+            return self._inside[0]
+        begin = self._find(max(self._noted, outer + 1))
+        while begin is not None:
+            if self._is_trusted(begin) and self._is_good(begin):
+                return begin
+            begin = self._find(begin + 1)
+        return None
+
+    def _note(self, outer: int) -> None:
+        """Note the ends of messages, up to the first info record that has begun."""
+        limit = (self._records[0] if self._records else self._end) - _HEAD
+        begin: int | None = self._find(max(self._noted, outer + 1))
+        while begin is not None and begin <= limit:
+            if self._is_trusted(begin):
+                heappush(self._ends, (begin + (self._length(begin) or 0), begin))
+            begin = self._find(begin + 1)
+        self._noted = max(self._noted, limit + 1)
+
+    # -- The bytes kept --------------------------------------------------------------
+
+    @property
+    def _end(self) -> int:
+        return self._dropped + len(self._buffer)
+
+    def _find(self, at: int) -> int | None:
+        """Return the first place, from this one on, where a message may begin."""
+        found = self._buffer.find(STX, at - self._dropped)
+        return None if found < 0 else found + self._dropped
+
+    def _head(self, at: int) -> bytes:
+        at -= self._dropped
+        return bytes(self._buffer[at : at + _HEAD])
+
+    def _length(self, at: int) -> int | None:
+        return _length(self._head(at))
+
+    def _is_trusted(self, at: int) -> bool:
+        """Return whether the head is one that is believed inside another message."""
+        head = self._head(at)
+        if head[4:] not in _NAMES or head[3] not in _TRUSTED_INSIDE:
+            return False
+        length = _length(head)
+        return length is not None and length <= LONGEST_FRAME
+
+    def _bcc(self, at: int, length: int) -> Bcc | None:
+        """Return the kind of checksum that is right for a message; ``None``: none."""
+        at -= self._dropped
+        return _bcc(self._sums[at + 1] ^ self._sums[at + length], self._buffer[at + 3])
+
+    def _frame(self, at: int, length: int) -> EwsFrame | None:
+        """Return the frame of a good message; ``None``: one to skip."""
+        bcc = self._bcc(at, length)
+        at -= self._dropped
+        raw = bytes(self._buffer[at : at + length])
+        if raw[3] not in _NAMED or bcc is None:
+            return None
+        return EwsFrame(
+            raw=raw,
+            message_id=MessageId(raw[3]),
+            name=raw[4:_HEAD].decode("ascii"),
+            data=raw[_HEAD:-1],
+            bcc=bcc,
+        )
+
+    def _drop(self, length: int) -> None:
+        """Drop bytes from the front of the buffer."""
+        del self._buffer[:length]
+        del self._sums[:length]
+        self._dropped += length
+        del self._records[: bisect_left(self._records, self._dropped)]
+        if not self._buffer:
+            self._ends.clear()
+            self._inside.clear()
 
 
 def _length(head: bytes) -> int | None:
@@ -388,24 +468,11 @@ def _length(head: bytes) -> int | None:
     return int.from_bytes(head[1:3]) + _EXTRA
 
 
-def _bcc(raw: bytes) -> Bcc | None:
-    """Return the kind of checksum that is right for a message; ``None``: neither."""
-    content = raw[1:-1]
-    for bcc in Bcc:
-        if checksum(content, bcc) == raw[-1]:
-            return bcc
-    return None
+def _bcc(total: int, message_id: int) -> Bcc | None:
+    """Return which checksum is right; ``None``: neither.
 
-
-def _frame(raw: bytes) -> EwsFrame | None:
-    """Return the frame of a good message; ``None``: one to skip."""
-    bcc = _bcc(raw)
-    if raw[3] not in _NAMED or bcc is None:
-        return None
-    return EwsFrame(
-        raw=raw,
-        message_id=MessageId(raw[3]),
-        name=raw[4:_HEAD].decode("ascii"),
-        data=raw[_HEAD:-1],
-        bcc=bcc,
-    )
+    ``total``: XOR of everything behind the STX, the checksum included.
+    """
+    if total == 0:
+        return Bcc.ALL
+    return Bcc.WITHOUT_MESSAGE_ID if total == message_id else None
