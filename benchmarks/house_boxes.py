@@ -35,7 +35,7 @@ def _find(
     from homeassistant.helpers import entity_registry as er  # noqa: PLC0415
 
     found: str | None = er.async_get(hass).async_get_entity_id(
-        platform, "evse_bus", f"{managed.key}_{key}"
+        platform, "evse_bus", f"{managed.unique_key}_{key}"
     )
     return found
 

@@ -46,6 +46,7 @@ async def add_entry(
     )
 
     from custom_components.evse_bus.evse.protocols import PROTOCOLS  # noqa: PLC0415
+    from custom_components.evse_bus.identity import identity_data  # noqa: PLC0415
 
     entry = ConfigEntry(
         data={"protocol": protocol, **address},
@@ -56,10 +57,11 @@ async def add_entry(
         source="user",
         subentries_data=[
             ConfigSubentryData(
-                data={"voltage": 230.0, "order_lifetime": None, **charger},
+                data={"voltage": 230.0, "order_lifetime": None, **charger}
+                | identity_data(PROTOCOLS[protocol], charger["serial"]),
                 subentry_type="charger",
                 title=f"{protocol} {charger['address']}",
-                unique_id=PROTOCOLS[protocol].unique_id(charger["serial"]),
+                unique_id=PROTOCOLS[protocol].identity(charger["serial"]),
             )
             for charger in chargers
         ],
@@ -136,13 +138,15 @@ async def _set_values(
     """Call number.set_value; return device-ID, value, start and end (s) of each call."""
     from homeassistant.helpers import entity_registry as er  # noqa: PLC0415
 
+    from custom_components.evse_bus.identity import identity_of  # noqa: PLC0415
+
     registry = er.async_get(hass)
     (entry,) = hass.config_entries.async_entries("evse_bus")
     numbers = [
         (
             int(subentry.data["address"]),
             registry.async_get_entity_id(
-                "number", "evse_bus", f"{subentry.subentry_id}_charging_current"
+                "number", "evse_bus", f"{identity_of(subentry)}_charging_current"
             ),
         )
         for subentry in entry.subentries.values()

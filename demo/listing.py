@@ -59,13 +59,13 @@ def list_buses(
             continue
         entry, subentry = entity["config_entry_id"], entity["config_subentry_id"]
         bus = buses.setdefault(entry, ListedBus(owners.get(entry, entry)))
-        key = entity["unique_id"].removeprefix(f"{subentry or entry}_")
+        owner = _owner(entity["unique_id"], owners)
+        key = entity["unique_id"].removeprefix(f"{owner}_")
         if subentry is None:
             bus.entities[key] = entity["entity_id"]
             continue
         if subentry not in chargers:
-            name = owners.get(subentry, subentry)
-            chargers[subentry] = ListedCharger(name)
+            chargers[subentry] = ListedCharger(owners.get(owner, owner))
             bus.chargers.append(chargers[subentry])
         charger = chargers[subentry]
         if (match := _CONNECTOR.fullmatch(key)) is None:
@@ -80,3 +80,15 @@ def list_buses(
     for charger in chargers.values():
         charger.connectors = dict(sorted(charger.connectors.items()))
     return sorted(buses.values(), key=lambda bus: bus.name)
+
+
+def _owner(unique_id: str, identifiers: Iterable[str]) -> str:
+    """Return the identifier with which a unique id begins: of a bus, or of a box.
+
+    Connectors and ports have longer ones.
+    """
+    return min(
+        (one for one in identifiers if unique_id.startswith(f"{one}_")),
+        key=len,
+        default=unique_id,
+    )

@@ -30,7 +30,7 @@ from pytest_homeassistant_custom_component.common import MockConfigEntry
 from custom_components.evse_bus.const import DOMAIN, SUBENTRY_CHARGER
 from custom_components.evse_bus.energy import TOTALS, TOTALS_KEY, TotalStore
 from custom_components.evse_bus.issues import report_orders_written
-from custom_components.evse_bus.orders import (
+from custom_components.evse_bus.stores.orders import (
     KNOWN_KEY,
     ORDERS,
     ORDERS_KEY,
@@ -67,9 +67,11 @@ def charger(
 
     Polled as fast as the bus goes, unless ``data`` says otherwise.
     """
+    known_by = _identity(protocol, serial)
     return ConfigSubentryDataWithId(
         subentry_id=f"{protocol}{address}",
         data={
+            **({} if known_by is None else {"identity": known_by}),
             "address": address,
             "serial": serial,
             "installation_limit": 16.0,
@@ -82,12 +84,16 @@ def charger(
         },
         subentry_type=SUBENTRY_CHARGER,
         title=title or f"Charger {address}",
-        unique_id=(
-            f"{protocol}_address_{address}"
-            if serial is None
-            else f"{protocol}_{serial}"
-        ),
+        unique_id=known_by,
     )
+
+
+def _identity(protocol: str, serial: str | None) -> str | None:
+    """Return what a box is known by for good; ``None``: its subentry's id."""
+    family = protocol.removesuffix("_network")
+    if serial is None or family.startswith("smartevse"):
+        return None
+    return f"{family}_{serial}"
 
 
 def bus_entry(
@@ -266,6 +272,12 @@ def subentry_id(entry: MockConfigEntry, index: int = 0) -> str:
     return list(entry.subentries)[index]
 
 
+def identity(entry: MockConfigEntry, index: int = 0) -> str:
+    """Return the beginning of the unique ids of one of a bus's chargers."""
+    subentry = list(entry.subentries.values())[index]
+    return str(subentry.data.get("identity", subentry.subentry_id))
+
+
 def entity_id(
     hass: HomeAssistant,
     platform: str,
@@ -276,7 +288,7 @@ def entity_id(
 ) -> str | None:
     """Return an entity of a charger; a connector's key begins with its number."""
     return er.async_get(hass).async_get_entity_id(
-        platform, DOMAIN, f"{subentry_id(entry, index)}_{key}"
+        platform, DOMAIN, f"{identity(entry, index)}_{key}"
     )
 
 

@@ -18,6 +18,7 @@ from homeassistant.helpers.entity_platform import async_get_platforms
 from homeassistant.util import slugify
 
 from custom_components.evse_bus.const import DOMAIN
+from custom_components.evse_bus.identity import identity_of
 
 UNSTEADY: Final = "…"
 """Stands for a state that depends on the moment of the snapshot."""
@@ -106,7 +107,7 @@ def entity_table(
                 entry.entity_category or "",
                 "" if enabled else _DISABLED,
                 entry.unique_id,
-                _key(entry),
+                _key(hass, entry),
                 entry.original_name or "",
             )
         )
@@ -193,14 +194,18 @@ def _option_notes(
     }
 
 
-def _key(entry: er.RegistryEntry) -> str:
+def _key(hass: HomeAssistant, entry: er.RegistryEntry) -> str:
     """Return the translation key; empty if the unique id ends with it, after its owner.
 
     An owner is a charger or a bus, and perhaps the number of a connector or port.
     """
     if entry.translation_key is None:
         return _NO_KEY
-    owner = entry.config_subentry_id or entry.config_entry_id
+    owner = entry.config_entry_id
+    if entry.config_subentry_id is not None:
+        bus = hass.config_entries.async_get_entry(owner or "")
+        assert bus is not None
+        owner = identity_of(bus.subentries[entry.config_subentry_id])
     key = entry.unique_id.removeprefix(f"{owner}_")
     if key[0].isdigit() and key[1] == "_":
         key = key[2:]

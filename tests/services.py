@@ -13,7 +13,7 @@ from pytest_homeassistant_custom_component.common import MockConfigEntry
 
 from custom_components.evse_bus.const import DOMAIN
 from custom_components.evse_bus.evse.ews import services as library
-from tests.common import call, get_entity, running, subentry_id, wait_until
+from tests.common import call, get_entity, identity, running, wait_until
 from tests.flow import english
 from tests.virtual import VirtualBus
 from tests.virtual.ews_box import EwsBox
@@ -48,7 +48,7 @@ class Scene:
     def device(self, port: int | None = None) -> str:
         """Return the id of the device of the box, or of one of its ports."""
         registry = dr.async_get(self.hass)
-        key = subentry_id(self.entry)
+        key = identity(self.entry)
         device: dr.AnyDeviceEntry | None
         if port is None:
             device = registry.async_get_device_by_identifier(

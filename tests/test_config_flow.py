@@ -83,6 +83,7 @@ async def test_abl_boxes_are_found_and_added(hass: HomeAssistant) -> None:
     assert left.data == {
         "address": 5,
         "serial": "2W22xy00000005",
+        "identity": "abl_2W22xy00000005",
         "installation_limit": 13,
         "voltage": 230,
         "poll_interval": PROTOCOLS["abl"]
@@ -119,7 +120,7 @@ async def test_nobody_answers_then_typed_in_by_hand(hass: HomeAssistant) -> None
 
     two, three = flow.result["result"].subentries.values()
     assert (two.data["address"], two.data["serial"]) == (2, None)
-    assert (three.title, three.unique_id) == ("Three", "abl_address_3")
+    assert (three.title, three.unique_id) == ("Three", None)
 
 
 async def test_searching_again_finds_a_box_switched_on_meanwhile(
@@ -155,7 +156,7 @@ async def test_typed_by_hand_keeps_the_serial_that_was_read(
         await flow.submit()
     four, one = flow.result["result"].subentries.values()
     assert four.unique_id == "abl_2W22xy00000004"
-    assert one.unique_id == "abl_address_1"
+    assert one.unique_id is None
 
 
 async def test_two_boxes_with_one_id_are_told_and_not_written_to(

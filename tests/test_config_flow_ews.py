@@ -94,6 +94,7 @@ async def test_box_is_found_added_and_runs(hass: HomeAssistant) -> None:
         assert yard.data == {
             "address": SERIAL,
             "serial": SERIAL,
+            "identity": f"ews_{SERIAL}",
             "ports": 2,
             "installation_limit": 13,
             "installation_limit_2": 9,
@@ -184,7 +185,7 @@ async def test_nobody_answers_then_the_first_box_that_comes_is_kept(
         entry = flow.result["result"]
         [yard] = entry.subentries.values()
         assert (yard.data["address"], yard.data["serial"]) == ("", None)
-        assert yard.unique_id == "ews_address_"
+        assert yard.unique_id is None
         await hass.async_block_till_done()
         assert entry.state is ConfigEntryState.LOADED
 
@@ -198,7 +199,8 @@ async def test_nobody_answers_then_the_first_box_that_comes_is_kept(
         await wait_until(hass, is_known)
         [yard] = entry.subentries.values()
         assert yard.data["serial"] == SERIAL
-        assert yard.unique_id == f"ews_{SERIAL}"
+        # Its entities stay what they are.
+        assert yard.unique_id is None
         # From now on it is this one, and no other.
         chargers = entry.runtime_data.chargers.values()
         await wait_until(
@@ -217,7 +219,7 @@ async def test_nobody_answers_then_the_first_box_that_comes_is_kept(
         await hass.async_block_till_done()
         [garden] = entry.subentries.values()
         assert (garden.title, garden.data["serial"]) == ("Garden", SERIAL)
-        assert garden.unique_id == f"ews_{SERIAL}"
+        assert garden.unique_id is None
         assert bus.opened == opened
         assert await hass.config_entries.async_unload(entry.entry_id)
 

@@ -192,9 +192,9 @@ async def test_two_dialogues_for_one_port_in_two_spellings(
             await port_step(hass, "evbox", url)
             for url in ("socket://gw:4001", "rfc2217://GW.local:4001/")
         ]
-        for flow in flows:
+        for flow, serial in zip(flows, ("42", "43"), strict=True):
             await flow.choose("manual")
-            await flow.submit({"serial_numbers": ["42"]})
+            await flow.submit({"serial_numbers": [serial]})
             await flow.submit(charger("Box", fail_safe_timeout=60))
             await flow.submit()
     assert flows[0].result["type"] is FlowResultType.CREATE_ENTRY

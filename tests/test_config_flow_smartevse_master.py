@@ -113,7 +113,7 @@ async def test_slaves_are_found_and_added(hass: HomeAssistant) -> None:
         "supply_minimum": 7.0,
     }
     left, right = entry.subentries.values()
-    assert left.unique_id == "smartevse_master_address_2"
+    assert left.unique_id is None
     assert left.data == {
         "address": 2,
         "serial": None,
@@ -215,7 +215,7 @@ async def test_slaves_are_typed_in(hass: HomeAssistant) -> None:
         await flow.submit()
     three, two = flow.result["result"].subentries.values()
     assert (three.data["address"], two.data["address"]) == (3, 2)
-    assert two.unique_id == "smartevse_master_address_2"
+    assert two.unique_id is None
 
 
 async def test_shared_supply_typed_once_is_offered_again(hass: HomeAssistant) -> None:

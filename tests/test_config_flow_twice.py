@@ -21,6 +21,7 @@ async def test_two_dialogues_for_one_port(hass: HomeAssistant) -> None:
         for flow in (first, second):
             await flow.submit({"chargers": ["1"], "installation_limit": 16})
             await flow.submit(charger("Box"))
+        for flow in (first, second):
             await flow.submit()
         assert first.result["type"] is FlowResultType.CREATE_ENTRY
         assert second.result["type"] is FlowResultType.ABORT

@@ -77,7 +77,6 @@ async def test_a_chargepoint_swapped_for_another(hass: HomeAssistant) -> None:
             entry,
             subentry,
             data={**subentry.data, "serial": "1923055"},
-            unique_id="evbox_1923055",
         )
         await wait_for_state(hass, maximum, "35.0")
         assert len(box.orders) > sent
@@ -141,7 +140,7 @@ async def test_a_serial_number_that_another_charger_has_is_not_bound(
         )
         await get_entity(hass, "sensor", entry, "1_status")
         await hass.async_block_till_done()
-        assert entry.subentries["abl1"].unique_id == "abl_address_1"
+        assert entry.subentries["abl1"].unique_id is None
         assert entry.subentries["abl1"].data["serial"] is None
         assert key in entry.subentries["abl1"].data
         await hass.config_entries.async_unload(entry.entry_id)

@@ -30,7 +30,7 @@ async def test_devices_hang_together(hass: HomeAssistant) -> None:
         devices = dr.async_get(hass)
         find = devices.async_get_device_by_identifier
         bus = find((DOMAIN, "bus"), "bus")
-        box = find((DOMAIN, "evbox1923054"), "bus")
+        box = find((DOMAIN, "evbox_1923054"), "bus")
         assert bus.via_device_id is None
         assert bus.config_subentry_id is None
         assert box.via_device_id == bus.id
@@ -38,7 +38,7 @@ async def test_devices_hang_together(hass: HomeAssistant) -> None:
         assert (box.manufacturer, box.serial_number) == ("EVBox", "1923054")
         for number in (1, 2):
             module = devices.async_get_child_device_by_identifier(
-                (DOMAIN, f"evbox1923054_{number}"), "bus"
+                (DOMAIN, f"evbox_1923054_{number}"), "bus"
             )
             assert module.parent_device_id == box.id
             assert module.name == f"Module {number}"
@@ -73,13 +73,16 @@ async def test_what_a_charger_was_stays_known_while_it_is_off(
 
 
 async def test_the_only_connector_is_no_device(hass: HomeAssistant) -> None:
+    known_by = f"abl_{AblBox(3).serial}"
     async with running(hass, AblBox(3)) as (entry, _):
         status = await get_entity(hass, "sensor", entry, "1_status")
-        box = dr.async_get(hass).async_get_device_by_identifier((DOMAIN, "abl3"), "bus")
+        box = dr.async_get(hass).async_get_device_by_identifier(
+            (DOMAIN, known_by), "bus"
+        )
         assert er.async_get(hass).async_get(status).device_id == box.id
         assert (box.manufacturer, box.sw_version) == ("ABL", "1.2")
         assert not dr.async_get(hass).async_get_child_device_by_identifier(
-            (DOMAIN, "abl3_1"), "bus"
+            (DOMAIN, f"{known_by}_1"), "bus"
         )
 
 
@@ -95,11 +98,11 @@ async def test_a_module_that_is_gone_can_be_deleted(
         power = await get_entity(hass, "sensor", entry, "2_power")
         devices = dr.async_get(hass)
         module = devices.async_get_child_device_by_identifier(
-            (DOMAIN, "evbox1923054_2"), "bus"
+            (DOMAIN, "evbox_1923054_2"), "bus"
         )
         for device in (
             devices.async_get_device_by_identifier((DOMAIN, "bus"), "bus"),
-            devices.async_get_device_by_identifier((DOMAIN, "evbox1923054"), "bus"),
+            devices.async_get_device_by_identifier((DOMAIN, "evbox_1923054"), "bus"),
             module,
         ):
             assert not await async_remove_config_entry_device(hass, entry, device)
@@ -151,6 +154,6 @@ async def test_a_device_of_a_bus_that_is_not_running(hass: HomeAssistant) -> Non
         await get_entity(hass, "sensor", entry, "2_energy")
         await hass.config_entries.async_unload(entry.entry_id)
         child = dr.async_get(hass).async_get_child_device_by_identifier(
-            (DOMAIN, "evbox1923054_2"), "bus"
+            (DOMAIN, "evbox_1923054_2"), "bus"
         )
         assert not await async_remove_config_entry_device(hass, entry, child)

@@ -131,7 +131,7 @@ async def test_of_one_device(hass: HomeAssistant) -> None:
     async with running(hass, one, two) as (entry, _):
         await get_entity(hass, "sensor", entry, "1_status", index=1)
         find = dr.async_get(hass).async_get_device_by_identifier
-        device = find((DOMAIN, "abl2"), "bus")
+        device = find((DOMAIN, f"abl_{two.serial}"), "bus")
         data = await async_get_device_diagnostics(hass, entry, device)
         assert data["charger"]["config"]["address"] == 2
         data = await async_get_device_diagnostics(

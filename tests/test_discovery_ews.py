@@ -90,6 +90,7 @@ async def test_box_that_dials_is_offered_and_added(hass: HomeAssistant) -> None:
             assert yard.data == {
                 "address": SERIAL,
                 "serial": SERIAL,
+                "identity": f"ews_{SERIAL}",
                 "ports": 2,
                 "installation_limit": 13,
                 "installation_limit_2": 10,
@@ -280,20 +281,21 @@ async def test_offers_go_with_their_listener(hass: HomeAssistant) -> None:
             assert open_one.result["reason"] == "listener_gone"
 
 
-async def test_box_set_up_elsewhere_meanwhile_is_not_added(hass: HomeAssistant) -> None:
+@pytest.mark.parametrize("at", ["charger", "confirm"])
+async def test_box_set_up_elsewhere_meanwhile_is_not_added(
+    hass: HomeAssistant, at: str
+) -> None:
     async with listening(hass) as entry:
         with dialling(entry):
             flow = await Flow.discovered(hass, await offered(hass))
             await flow.submit()
+            if at == "confirm":
+                await flow.submit(typed_box("Yard", 16))
+                assert flow.step == "confirm_ews_network"
             elsewhere = bus_entry("ews", "/dev/serial/by-id/none", stored_box(SERIAL))
             elsewhere.add_to_hass(hass)
-            await flow.submit(typed_box("Yard", 16))
-            assert flow.errors == {"base": "box_already_set_up"}
-            await hass.config_entries.async_remove(elsewhere.entry_id)
-            await flow.submit(typed_box("Yard", 16))
-            assert flow.step == "confirm_ews_network"
-            elsewhere.add_to_hass(hass)
-            await flow.submit()
+            await flow.submit(typed_box("Yard", 16) if at == "charger" else {})
             assert flow.result["reason"] == "box_already_set_up"
+            assert flow.tells("Yard (Bus)")
             assert not entry.subentries
             assert entry.state is ConfigEntryState.LOADED

@@ -33,7 +33,7 @@ from custom_components.evse_bus.energy import (
     TotalStore,
 )
 from custom_components.evse_bus.evse.meter import most_energy
-from custom_components.evse_bus.storage import StoredFile
+from custom_components.evse_bus.stores.file import StoredFile
 from tests.common import crash, get_entity, running, shut_down, wait_for_state
 from tests.virtual import AblBox, Car, EvboxChargePoint, Module
 

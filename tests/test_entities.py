@@ -14,7 +14,14 @@ from syrupy.assertion import SnapshotAssertion
 from custom_components.evse_bus.const import DOMAIN
 from custom_components.evse_bus.evse.protocols import PROTOCOLS
 from custom_components.evse_bus.sensor_tables import BUS_SENSORS, CHARGER_STATISTICS
-from tests.common import call, get_entity, running, wait_for_state, wait_until
+from tests.common import (
+    call,
+    get_entity,
+    identity,
+    running,
+    wait_for_state,
+    wait_until,
+)
 from tests.entity_table import VARYING, device_table, entity_table
 from tests.ews import listening
 from tests.virtual import AblBox, EvboxChargePoint, EwsBox, SmartEvse
@@ -102,7 +109,7 @@ async def test_devices(
     async with up(hass, protocol, device, poll_interval=0.5) as (entry, _):
         await get_entity(hass, platform, entry, last)
         registry = dr.async_get(hass)
-        charger = next(iter(entry.subentries))
+        charger = identity(entry)
         find = registry.async_get_device_by_identifier
         child = registry.async_get_child_device_by_identifier
         devices = [
@@ -153,7 +160,7 @@ async def test_only_what_a_charger_has(hass: HomeAssistant) -> None:
         await get_entity(hass, "sensor", entry, "1_status")
         await hass.async_block_till_done()
         keys = {
-            one.unique_id.removeprefix("abl1_")
+            one.unique_id.removeprefix(f"{identity(entry)}_")
             for one in er.async_entries_for_config_entry(er.async_get(hass), "bus")
             if one.config_subentry_id
         }
@@ -201,7 +208,7 @@ async def test_counters_are_disabled_by_default(hass: HomeAssistant) -> None:
         }
     assert disabled == {
         *(f"bus_{one.key}" for one in BUS_SENSORS),
-        *(f"abl1_{one.key}" for one in CHARGER_STATISTICS),
+        *(f"{identity(entry)}_{one.key}" for one in CHARGER_STATISTICS),
     }
 
 

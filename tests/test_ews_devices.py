@@ -22,6 +22,8 @@ from tests.common import (
 from tests.ews import charge, polled, quick_car
 from tests.virtual import EwsBox
 
+YARD = f"ews_{EwsBox().serial}"
+
 
 def device(hass: HomeAssistant, key: str) -> dr.DeviceEntry | None:
     return dr.async_get(hass).async_get_device_by_identifier((DOMAIN, key), "bus")
@@ -54,7 +56,7 @@ async def test_a_box_and_its_two_ports(hass: HomeAssistant) -> None:
         await get_entity(hass, "sensor", entry, "2_status")
         await get_entity(hass, "event", entry, "card")
         await hass.async_block_till_done()
-        bus, box = device(hass, "bus"), device(hass, "ews01")
+        bus, box = device(hass, "bus"), device(hass, YARD)
         assert bus is not None
         assert box is not None
         assert bus.via_device_id is None
@@ -69,18 +71,18 @@ async def test_a_box_and_its_two_ports(hass: HomeAssistant) -> None:
         found = by_device(hass)
         # What is of the whole box is there once.
         assert found[box.id] == {
-            f"ews01_{key}"
+            f"{YARD}_{key}"
             for key in ("card", "fail_safe", "reset", "server_connected", "ventilating")
         }
         for number in (1, 2):
-            port = child(hass, f"ews01_{number}")
+            port = child(hass, f"{YARD}_{number}")
             assert port is not None
             assert port.parent_device_id == box.id
             assert port.name == f"Port {number}"
             assert port.config_subentry_id == "ews01"
-            assert all(one.startswith(f"ews01_{number}_") for one in found[port.id])
-            assert f"ews01_{number}_charging_current" in found[port.id]
-            assert f"ews01_{number}_status" in found[port.id]
+            assert all(one.startswith(f"{YARD}_{number}_") for one in found[port.id])
+            assert f"{YARD}_{number}_charging_current" in found[port.id]
+            assert f"{YARD}_{number}_status" in found[port.id]
         names = {
             er.async_get(hass).async_get(one.entity_id).original_name  # type: ignore[union-attr]
             for one in er.async_entries_for_config_entry(er.async_get(hass), "bus")
@@ -92,13 +94,15 @@ async def test_with_one_port_all_is_the_boxs(hass: HomeAssistant) -> None:
     box = EwsBox(ports=1, cars=(quick_car(),))
     async with running(hass, box, ports=1) as (entry, bus):
         await charge(hass, entry, bus, box)
-        registered = device(hass, "ews01")
+        registered = device(hass, YARD)
         assert registered is not None
-        assert child(hass, "ews01_1") is None
+        assert child(hass, f"{YARD}_1") is None
         found = by_device(hass)
-        mine = {one for one in found[registered.id] if one.startswith("ews01_")}
-        assert {"ews01_1_status", "ews01_1_charging_current", "ews01_reset"} <= mine
-        assert not any("ews01_2" in one for ids in found.values() for one in ids)
+        mine = {one for one in found[registered.id] if one.startswith(f"{YARD}_")}
+        assert {
+            f"{YARD}_{key}" for key in ("1_status", "1_charging_current", "reset")
+        } <= mine
+        assert not any(f"{YARD}_2" in one for ids in found.values() for one in ids)
         assert len(found) == 2
         limit = entity_id(hass, "number", entry, "1_charging_current")
         assert limit == "number.yard_charging_current"
@@ -121,9 +125,9 @@ async def test_a_second_port_comes_and_goes(hass: HomeAssistant) -> None:
         two = await get_entity(hass, "number", entry, "2_charging_current")
         await call(hass, "number.set_value", two, value=12)
         assert box.ports[1].limit == 12
-        first = child(hass, "ews01_1")
+        first = child(hass, f"{YARD}_1")
         assert first is not None
-        assert child(hass, "ews01_2") is not None
+        assert child(hass, f"{YARD}_2") is not None
         known = registry.async_get(status)
         assert known is not None
         assert known.device_id == first.id
@@ -133,7 +137,7 @@ async def test_a_second_port_comes_and_goes(hass: HomeAssistant) -> None:
 
         use_ports(hass, entry, 1)
         await hass.async_block_till_done()
-        assert child(hass, "ews01_2") is None
+        assert child(hass, f"{YARD}_2") is None
         assert hass.states.get(two) is None
         assert registry.async_get(two) is None
         await polled(bus, box)
@@ -153,9 +157,9 @@ async def test_a_port_that_is_used_cannot_be_deleted(hass: HomeAssistant) -> Non
         status = await get_entity(hass, "sensor", entry, "2_status")
         found = (
             device(hass, "bus"),
-            device(hass, "ews01"),
-            child(hass, "ews01_1"),
-            child(hass, "ews01_2"),
+            device(hass, YARD),
+            child(hass, f"{YARD}_1"),
+            child(hass, f"{YARD}_2"),
         )
         assert None not in found
         bus.unplug()
@@ -172,8 +176,8 @@ async def test_a_box_that_is_removed(hass: HomeAssistant) -> None:
         told = len(box.writes)
         hass.config_entries.async_remove_subentry(entry, "ews01")
         await hass.async_block_till_done()
-        assert device(hass, "ews01") is None
-        assert child(hass, "ews01_1") is None
+        assert device(hass, YARD) is None
+        assert child(hass, f"{YARD}_1") is None
         assert set(by_device(hass)) == {device(hass, "bus").id}  # type: ignore[union-attr]
         assert not entry.runtime_data.chargers
         assert not entry.runtime_data.bus.chargers

@@ -21,6 +21,7 @@ from custom_components.evse_bus.evse.ews.network import line
 from tests.common import (
     call,
     get_entity,
+    identity,
     running,
     wait_for_state,
 )
@@ -28,6 +29,7 @@ from tests.ews import HOST, charge, listening, plug_in, polled, quick_car
 from tests.virtual import EwsBox, EwsCard, VirtualBus
 
 SERIAL = "728193645508"
+KNOWN_BY = f"ews_{SERIAL}"
 CARD = EwsCard(
     group=7321, number=5417, name="SCHMIDT", tag=bytes.fromhex("04a1b2c3d4e5f6")
 )
@@ -100,7 +102,7 @@ async def live(
     await wait_for_state(hass, status, "charging")
     registry = dr.async_get(hass)
     device = registry.async_get_device_by_identifier(
-        (DOMAIN, next(iter(entry.subentries))), entry.entry_id
+        (DOMAIN, identity(entry)), entry.entry_id
     )
     assert device is not None
     read = {
@@ -134,7 +136,7 @@ async def all_diagnostics(
     )
     for port in (1, 2):
         child = registry.async_get_child_device_by_identifier(
-            (DOMAIN, f"ews08_{port}"), "bus"
+            (DOMAIN, f"{KNOWN_BY}_{port}"), "bus"
         )
         assert child is not None
         devices.append(child)
@@ -155,7 +157,7 @@ async def test_nothing_private_on_a_port(
             key: assert_private(data, bus.url)
             for key, data in (await all_diagnostics(hass, entry)).items()
         }
-        assert set(told) == {"entry", "bus", "ews08", "ews08_1", "ews08_2"}
+        assert set(told) == {"entry", "bus", KNOWN_BY, f"{KNOWN_BY}_1", f"{KNOWN_BY}_2"}
 
         # And yet there is all that helps to find a fault.
         whole = told["entry"]
@@ -216,9 +218,9 @@ async def test_each_device_tells_of_itself(hass: HomeAssistant) -> None:
             chargers = data.get("chargers") or [data["charger"]]
             return [one["config"]["address"] for one in chargers]
 
-        assert addresses("ews08_1") == [1]
-        assert addresses("ews08_2") == [2]
-        assert addresses("ews08") == addresses("bus") == [1, 2]
+        assert addresses(f"{KNOWN_BY}_1") == [1]
+        assert addresses(f"{KNOWN_BY}_2") == [2]
+        assert addresses(KNOWN_BY) == addresses("bus") == [1, 2]
 
 
 @pytest.mark.usefixtures("socket_enabled")
@@ -260,7 +262,7 @@ async def test_nothing_private_over_the_network(
         (connected,) = whole["boxes"]
         assert connected["bus"]["connected"] is True
         assert connected["frames"]
-        assert told["ews08_2"]["frames"]
+        assert told[f"{KNOWN_BY}_2"]["frames"]
     assert_log_private(caplog)
 
 

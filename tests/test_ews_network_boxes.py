@@ -120,13 +120,15 @@ async def test_another_box_takes_the_place_of_one(hass: HomeAssistant) -> None:
                     **subentry.data,
                     "address": new.serial,
                     "serial": new.serial,
+                    "identity": f"ews_{new.serial}",
                 },
                 unique_id=f"ews_{new.serial}",
             )
             await other.wait_for_async(
-                lambda: (new.ports[0].limit, new.ports[1].limit) == (6, 9), timeout=10
+                lambda: (new.ports[0].limit, new.ports[1].limit) == (6, 6), timeout=10
             )
-            await wait_for_state(hass, limit, "9.0")
+            # What was ordered was meant for the other box.
+            await wait_for_state(hass, limit, "6.0")
             await wait_for_state(hass, BOXES, "1")
             told = len(old.writes)
             await dialler.wait_for_async(lambda: old.link_up)

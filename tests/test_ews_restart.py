@@ -8,7 +8,7 @@ from homeassistant.helpers import issue_registry as ir
 import pytest
 
 from custom_components.evse_bus.const import DOMAIN
-from custom_components.evse_bus.orders import ORDERS_KEY
+from custom_components.evse_bus.stores.orders import ORDERS_KEY
 from tests.common import (
     call,
     crash,

@@ -25,13 +25,15 @@ from homeassistant.helpers import (
 import pytest
 
 from custom_components.evse_bus.const import DOMAIN
-from custom_components.evse_bus.orders import ORDERS_KEY
+from custom_components.evse_bus.stores.orders import ORDERS_KEY
 from tests.common import (
     bus_entry,
     call,
     charger,
     charger_of,
+    entity_id,
     get_entity,
+    identity,
     running,
     setup_bus,
     state_of,
@@ -308,7 +310,7 @@ async def test_a_changed_set_up_is_followed_in_place(hass: HomeAssistant) -> Non
         assert managed.charger is before
         assert bus.opened == 1
         device = dr.async_get(hass).async_get_device_by_identifier(
-            (DOMAIN, "abl1"), "bus"
+            (DOMAIN, identity(entry)), "bus"
         )
         assert device.name == "Garage"
 
@@ -376,7 +378,10 @@ async def test_a_charger_that_nobody_had_a_serial_number_for(
         await hass.async_block_till_done()
         subentry = entry.subentries["abl1"]
         assert subentry.data["serial"] == "2W22xy00000001"
-        assert subentry.unique_id == "abl_2W22xy00000001"
+        # Its entities stay what they are.
+        assert subentry.unique_id is None
+        assert entity_id(hass, "sensor", entry, "1_status") == status
+        assert identity(entry) == "abl1"
         assert entry.runtime_data.chargers["abl1"].charger.config.serial == (
             "2W22xy00000001"
         )

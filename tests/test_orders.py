@@ -24,7 +24,7 @@ from pytest_homeassistant_custom_component.common import async_fire_time_changed
 from custom_components.evse_bus.const import DOMAIN
 from custom_components.evse_bus.evse.errors import RefusedOrderError
 from custom_components.evse_bus.evse.model import CurrentLimit, Orders
-from custom_components.evse_bus.orders import (
+from custom_components.evse_bus.stores.orders import (
     KNOWN_KEY,
     ORDERS_KEY,
     RETRY_LIMIT,

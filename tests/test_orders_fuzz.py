@@ -14,10 +14,10 @@ from unittest.mock import patch
 from homeassistant.core import HomeAssistant
 from hypothesis import example, given, strategies as st
 
-from custom_components.evse_bus import orders as module
 from custom_components.evse_bus.evse.model import CurrentLimit, OrderChange, Orders
 from custom_components.evse_bus.evse.safety import cautious
-from custom_components.evse_bus.orders import (
+from custom_components.evse_bus.stores import orders as module
+from custom_components.evse_bus.stores.orders import (
     KNOWN_KEY,
     ORDERS_KEY,
     OrderStore,

@@ -16,13 +16,13 @@ from homeassistant.core import HomeAssistant
 from hypothesis import example, given, settings, strategies as st
 import pytest
 
-from custom_components.evse_bus import orders as module
 from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.errors import EvseError
 from custom_components.evse_bus.evse.evbox import PROTOCOL, EvboxCharger, EvboxConfig
 from custom_components.evse_bus.evse.evbox.frames import EvboxFramer
 from custom_components.evse_bus.evse.model import CurrentLimit, OrderChange, Orders
-from custom_components.evse_bus.orders import ORDERS_KEY, OrderStore, stopped
+from custom_components.evse_bus.stores import orders as module
+from custom_components.evse_bus.stores.orders import ORDERS_KEY, OrderStore, stopped
 from tests.evse.evbox.scene import EvboxLine
 from tests.simulated_time import simulate
 from tests.test_orders_fuzz import Disk, DiskFile

@@ -17,7 +17,7 @@ import pytest
 from pytest_homeassistant_custom_component.common import async_fire_time_changed
 
 from custom_components.evse_bus.const import DOMAIN
-from custom_components.evse_bus.orders import ORDERS_KEY
+from custom_components.evse_bus.stores.orders import ORDERS_KEY
 from tests.common import (
     bus_entry,
     call,
@@ -256,9 +256,8 @@ async def test_ids_never_contain_the_port_or_an_address(hass: HomeAssistant) -> 
         devices = dr.async_entries_for_config_entry(dr.async_get(hass), "bus")
         ids = [one.unique_id for one in entities]
         ids += [key for one in devices for _, key in one.identifiers]
-        own = ("bus", "abl7")
-        assert all(one in own or one.startswith(("bus_", "abl7_")) for one in ids)
+        own = ("bus", f"abl_{box.serial}")
+        assert all(one in own or one.startswith(("bus_", f"{own[1]}_")) for one in ids)
         port = bus.url.rsplit("/", 1)[-1]
         assert not any(bus.url in one or one.endswith(f"/{port}") for one in ids)
-        assert not any(box.serial in one for one in ids)
         assert entry.unique_id is None

@@ -19,7 +19,7 @@ from custom_components.evse_bus.const import DOMAIN
 from custom_components.evse_bus.errors import translated_errors
 from custom_components.evse_bus.evse.ews.wire.answers import EwsRefusedError, Refusal
 from custom_components.evse_bus.evse.ews.wire.frames import CommandId
-from tests.common import running, subentry_id, wait_until
+from tests.common import identity, running, wait_until
 from tests.virtual import AblBox
 from tests.virtual.ews_box import EwsBox
 from tests.virtual.ews_rfid import Card
@@ -81,7 +81,7 @@ async def test_others_are_not_meant(hass: HomeAssistant) -> None:
         for device_id, key in (
             ("nobody", "service_device_not_found"),
             (stranger.id, "service_device_wrong_domain"),
-            (devices[subentry_id(entry)], "not_ews_box"),
+            (devices[identity(entry)], "not_ews_box"),
             (devices[entry.entry_id], "not_ews_box"),
         ):
             with pytest.raises(ServiceValidationError) as told:

@@ -11,7 +11,7 @@ import pytest
 
 from custom_components.evse_bus import managed_charger
 from custom_components.evse_bus.evse.smartevse import PolledSmartEvse
-from custom_components.evse_bus.orders import ORDERS_KEY
+from custom_components.evse_bus.stores.orders import ORDERS_KEY
 from tests.common import (
     call,
     get_entity,

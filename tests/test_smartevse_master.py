@@ -14,7 +14,7 @@ from pytest_homeassistant_custom_component.common import MockConfigEntry
 
 from custom_components.evse_bus.const import DOMAIN
 from custom_components.evse_bus.diagnostics import async_get_config_entry_diagnostics
-from custom_components.evse_bus.orders import ORDERS_KEY, Record, SupplyOrder
+from custom_components.evse_bus.stores.orders import ORDERS_KEY, Record, SupplyOrder
 from tests.common import (
     call,
     charger,

@@ -17,6 +17,7 @@ from tests.common import (
     call,
     entity_id,
     get_entity,
+    identity,
     running,
     setup_bus,
     state_of,
@@ -70,9 +71,8 @@ async def change(
 def port_device(
     hass: HomeAssistant, entry: MockConfigEntry, port: int
 ) -> dr.ChildDeviceEntry | None:
-    [subentry_id] = entry.subentries
     return dr.async_get(hass).async_get_child_device_by_identifier(
-        (DOMAIN, f"{subentry_id}_{port}"), entry.entry_id
+        (DOMAIN, f"{identity(entry)}_{port}"), entry.entry_id
     )
 
 
@@ -273,7 +273,7 @@ async def test_second_port_goes_and_comes_back(hass: HomeAssistant) -> None:
             assert not [
                 one.entity_id
                 for one in registry.entities.values()
-                if one.unique_id.startswith(f"{stored.subentry_id}_2")
+                if one.unique_id.startswith(f"{identity(entry)}_2")
             ]
             # The other one has not noticed anything.
             [managed] = entry.runtime_data.chargers.values()

@@ -90,7 +90,7 @@ async def test_slave_is_added_to_a_bus_that_runs(hass: HomeAssistant) -> None:
         await hass.async_block_till_done()
 
         new = get(entry, "New")
-        assert new.unique_id == "smartevse_master_address_3"
+        assert new.unique_id is None
         assert new.data["address"] == 3
         # In place: the bus was neither closed nor opened again, and nobody stopped.
         assert entry.runtime_data.bus is running
@@ -214,7 +214,7 @@ async def test_box_is_searched_on_a_bus_that_has_lost_its_own(
         await flow.submit(charger("New") | {"stop_on_shutdown": False})
         await flow.submit()
         await hass.async_block_till_done()
-        assert get(entry, "New").unique_id == "smartevse_address_0"
+        assert get(entry, "New").unique_id is None
         [running] = entry.runtime_data.bus.chargers.values()
         await bus.wait_for_async(lambda: running.available)
         await take_down(hass, entry)
@@ -249,7 +249,7 @@ async def test_polled_box_is_changed_in_place(hass: HomeAssistant) -> None:
         assert flow.result["reason"] == "reconfigure_successful"
         await hass.async_block_till_done()
         changed = get(entry, "Car port")
-        assert changed.unique_id == "smartevse_4711"
+        assert changed.unique_id is None
         assert changed.data["installation_limit"] == 10
         assert changed.data["order_lifetime"] == 20
         assert changed.data["stop_on_shutdown"] is True
@@ -287,7 +287,7 @@ async def test_slave_is_changed_in_place(hass: HomeAssistant) -> None:
         assert flow.result["reason"] == "reconfigure_successful"
         await hass.async_block_till_done()
         right = get(entry, "Right")
-        assert right.unique_id == "smartevse_master_address_4"
+        assert right.unique_id is None
         assert right.data["address"] == 4
         assert right.data["installation_limit"] == 13
         assert bus.opened == 1

@@ -11,7 +11,7 @@ import pytest
 
 from custom_components.evse_bus.evse.errors import RefusedOrderError
 from custom_components.evse_bus.evse.model import Circuit, CurrentLimit, Orders
-from custom_components.evse_bus.orders import (
+from custom_components.evse_bus.stores.orders import (
     ORDERS_KEY,
     OrderStore,
     Record,

@@ -210,7 +210,8 @@ def test_the_coordinator_does_not_know_what_stands_on_it() -> None:
     }
     for name in (
         *("coordinator", "connections", "devices", "discovery", "issues"),
-        *("managed_charger", "supply", "orders", "configuration", "errors", "const"),
+        *("managed_charger", "supply", "configuration", "errors", "const", "identity"),
+        *("stores/file", "stores/orders"),
     ):
         used = local(INTEGRATION / f"{name}.py", INTEGRATION)
         assert not {one.split(".")[0] for one in used} & above, name

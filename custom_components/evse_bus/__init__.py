@@ -29,9 +29,10 @@ from .discovery import (
 from .energy import TOTALS, TotalStore
 from .errors import not_ready
 from .evse.errors import LineError
+from .identity import identity_of, stands_on_serial
 from .issues import report_orders_written
-from .orders import ORDERS, OrderStore, bus_key, subentry_keys
 from .services import async_register
+from .stores.orders import ORDERS, OrderStore, bus_key, subentry_keys
 
 CONFIG_SCHEMA = cv.config_entry_only_config_schema(DOMAIN)
 
@@ -109,9 +110,12 @@ async def async_remove_entry(hass: HomeAssistant, entry: EvseBusConfigEntry) -> 
     orders = hass.data[ORDERS]
     await orders.async_load()
     keys = [bus_key(entry.entry_id)]
-    for subentry_id in entry.subentries:
-        keys += subentry_keys(subentry_id, protocol_of(entry.data).ports)
-        await hass.data[TOTALS].async_forget(subentry_id)
+    protocol = protocol_of(entry.data)
+    for subentry in entry.subentries.values():
+        identity = identity_of(subentry)
+        keys += subentry_keys(identity, protocol.ports)
+        if not stands_on_serial(protocol, subentry):
+            await hass.data[TOTALS].async_forget(identity)
     await orders.async_forget(keys)
 
 

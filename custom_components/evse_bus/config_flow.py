@@ -317,6 +317,8 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
         for other in self._async_current_entries(include_ignore=False):
             if is_same_url(device, other.data.get(CONF_DEVICE, "")):
                 return self.async_abort(reason="already_configured")
+        if (held := self.find_held()) is not None:
+            return self.abort_held(held)
         return self.async_create_entry(
             title=_title(self.bus_data), data=self.bus_data, subentries=chargers
         )

@@ -33,6 +33,9 @@ Its own address is stored under homeassistant.const.CONF_HOST and CONF_PORT.
 
 SUBENTRY_CHARGER: Final = "charger"
 
+CONF_IDENTITY: Final = "identity"
+"""Identity by which the box is known for good (`identity.py`); missing: the subentry's
+id."""
 CONF_SERIAL: Final = "serial"
 """Serial number as text, or None: then the first one read is stored."""
 CONF_INSTALLATION_LIMIT: Final = "installation_limit"

@@ -35,9 +35,10 @@ from .evse.bus import Bus
 from .evse.listeners import notify
 from .evse.model import ChargerConfig, Circuit, Orders
 from .evse.safety import cautious
+from .identity import holder, identity_of, stands_on_serial
 from .issues import NOT_STORED, BusIssues
 from .managed_charger import ManagedCharger, async_shut_down_chargers
-from .orders import (
+from .stores.orders import (
     ORDERS,
     async_run_uncancelled,
     bus_key,
@@ -201,7 +202,11 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
             for key in self.chargers.keys() - configured.keys():
                 await self._async_remove_charger(self.chargers[key])
             for key, (subentry, config) in configured.items():
-                if (managed := self.chargers.get(key)) is None:
+                managed = self.chargers.get(key)
+                if managed and managed.identity != identity_of(subentry):
+                    await self._async_replace_charger(managed)
+                    managed = None
+                if managed is None:
                     await self._async_add_charger(subentry, config)
                 else:
                     await self._async_change_charger(managed, subentry, config)
@@ -220,22 +225,24 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         self, subentry: ConfigSubentry, config: ChargerConfig
     ) -> None:
         key = config.key
-        order_keys = charger_keys(self.protocol, subentry.subentry_id, config)
+        identity = identity_of(subentry)
+        order_keys = charger_keys(self.protocol, identity, config)
+        port_number = config.address if self.protocol.ports > 1 else None
         first = initial_orders(subentry, config)
+        await self._async_hand_over(subentry)
         orders = await self.orders.async_begin(
             order_keys,
             first=first,
             fallback=stopped(first),
             owner=subentry.subentry_id,
             # The device registry outlives restarts.
-            registered=self.devices.has(key, subentry.subentry_id),
+            registered=self.devices.has_charger(identity, port_number),
         )
         if orders is None:
             self._not_stored[key] = order_keys
             return
         self._not_stored.pop(key, None)
         charger = self.protocol.charger(config, orders)
-        port_number = config.address if self.protocol.ports > 1 else None
         bus = await self.connections.acquire_bus(config, subentry.title)
         managed = ManagedCharger(subentry, charger, bus, order_keys[0], port_number)
         self.chargers[key] = managed
@@ -243,7 +250,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         self._put_on_bus(managed)
         self._report_lost_orders(managed)
         self._add_entities(managed)
-        async_set_up_now(self.hass, subentry)
+        async_set_up_now(self.hass, self.protocol.identity(config.serial))
 
     async def _async_change_charger(
         self, managed: ManagedCharger, subentry: ConfigSubentry, config: ChargerConfig
@@ -254,7 +261,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
             return
         LOGGER.debug("%s: configuration changed", config.name)
         # Its new serial number may be that of a box that is being offered.
-        async_set_up_now(self.hass, subentry)
+        async_set_up_now(self.hass, self.protocol.identity(config.serial))
         earlier = self._move_orders(managed, config)
         if earlier is None and changes_in_place(old.config, config):
             old.reconfigure(config)
@@ -284,7 +291,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
 
         Returns the orders that the box had earlier, if they lower those it has now.
         """
-        keys = charger_keys(self.protocol, managed.subentry_id, config)
+        keys = charger_keys(self.protocol, managed.identity, config)
         if keys[0] == managed.order_key:
             return None
         orders = self.orders.move(keys, managed.order_key, managed.subentry_id)
@@ -304,11 +311,48 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         self.devices.remove_port(managed)
         self.issues.forget(managed)
         await self.orders.async_forget(
-            charger_keys(self.protocol, managed.subentry_id, managed.charger.config)
+            charger_keys(self.protocol, managed.identity, managed.charger.config)
         )
-        if managed.subentry_id not in self.config_entry.subentries:
-            await self.hass.data[TOTALS].async_forget(managed.subentry_id)
+        if (
+            managed.subentry_id not in self.config_entry.subentries
+            and not stands_on_serial(self.protocol, managed.subentry)
+        ):
+            await self.hass.data[TOTALS].async_forget(managed.identity)
         self._notify(BUS)
+
+    async def _async_replace_charger(self, managed: ManagedCharger) -> None:
+        """Take a charger off the bus whose box was replaced by another.
+
+        Its orders, devices and entities stay, to be handed over.
+        """
+        managed.unsubscribe()
+        await managed.bus.remove(managed.charger)
+        await self.connections.release_bus(managed.bus)
+        await managed.async_remove_entities()
+        del self.chargers[managed.key]
+        self.issues.forget(managed)
+
+    async def _async_hand_over(self, subentry: ConfigSubentry) -> None:
+        """Let what belonged to another box of this subentry belong to its present one.
+
+        Also after a restart in between: files first, then the registries.
+        """
+        identity = identity_of(subentry)
+        before = self.devices.registered_identity(subentry.subentry_id)
+        if before is None or before == identity:
+            return
+        LOGGER.info("%s is another box now", subentry.title)
+        for config in charger_configs(self.config_entry.data, subentry):
+            keys = charger_keys(self.protocol, identity, config)
+            self.orders.hand_over(
+                subentry.subentry_id,
+                keys[0],
+                initial_orders(subentry, config),
+                f"_{config.address}" if self.protocol.ports > 1 else "",
+            )
+        await self.orders.async_flush()
+        await self.hass.data[TOTALS].async_hand_over(before, identity)
+        self.devices.hand_over(subentry.subentry_id, before, identity)
 
     def _put_on_bus(self, managed: ManagedCharger) -> None:
         charger = managed.charger
@@ -386,18 +430,12 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         subentry = managed.subentry
         if info is None or info.serial is None or subentry.data.get(CONF_SERIAL):
             return
-        unique_id = self.protocol.unique_id(info.serial)
-        if any(
-            other.unique_id == unique_id
-            for other in self.config_entry.subentries.values()
-            if other is not subentry
-        ):
+        if holder(self.hass, self.protocol.identity(info.serial), subentry) is not None:
             return
         self.hass.config_entries.async_update_subentry(
             self.config_entry,
             subentry,
             data={**subentry.data, CONF_SERIAL: info.serial},
-            unique_id=unique_id,
         )
 
     # -- Entities and devices ----------------------------------------------------
@@ -419,7 +457,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         """Return whether a device may be removed: only that of a missing connector."""
         in_use = {self.config_entry.entry_id}
         for managed in self.chargers.values():
-            in_use |= {managed.subentry_id, managed.key}
+            in_use |= {managed.identity, managed.unique_key}
             for number in tuple(managed.connector_numbers):
                 key = managed.connector_key(number)
                 # A port is part of the configuration, even while its box is off.

@@ -39,17 +39,58 @@ class BusDevices:
         )
         self._bus_id = device.id
 
-    def has(self, key: str, subentry_id: str | None = None) -> bool:
-        """Return whether a bus or a charger is registered, by its key.
-
-        The first port of a box counts as registered with the box of its subentry.
-        """
+    def has(self, key: str) -> bool:
+        """Return whether the bus or a box is registered, by its identifier."""
         find = self._registry.async_get_device_by_identifier
-        if subentry_id is not None and key in (subentry_id, f"{subentry_id}_1"):
-            return find((DOMAIN, subentry_id), self._entry.entry_id) is not None
-        return self._child(key) is not None or (
-            find((DOMAIN, key), self._entry.entry_id) is not None
-        )
+        return find((DOMAIN, key), self._entry.entry_id) is not None
+
+    def has_charger(self, identity: str, port: int | None) -> bool:
+        """Return whether a charger is registered: a box, or one port of it.
+
+        The first port counts as registered with its box.
+        """
+        if port in (None, 1):
+            return self.has(identity)
+        return self._child(f"{identity}_{port}") is not None
+
+    def registered_identity(self, subentry_id: str) -> str | None:
+        """Return the identity under which a box is registered; ``None``: it is not."""
+        for device in dr.async_entries_for_config_entry(
+            self._registry, self._entry.entry_id
+        ):
+            if device.config_subentry_id == subentry_id:
+                return next(
+                    key for domain, key in device.identifiers if domain == DOMAIN
+                )
+        return None
+
+    def hand_over(self, subentry_id: str, old: str, new: str) -> None:
+        """Give the devices and entities of a box to the box that replaces it.
+
+        Names, areas, entity ids and history stay as they are.
+        """
+
+        def renamed(key: str) -> str:
+            return f"{new}{key.removeprefix(old)}"
+
+        registry, entry_id = self._registry, self._entry.entry_id
+        for child in dr.async_child_entries_for_config_entry(registry, entry_id):
+            if child.config_subentry_id == subentry_id:
+                identifiers = {
+                    (domain, renamed(key)) for domain, key in child.identifiers
+                }
+                registry.async_update_child_device(
+                    child.id, new_identifiers=identifiers
+                )
+        for device in dr.async_entries_for_config_entry(registry, entry_id):
+            if device.config_subentry_id == subentry_id:
+                registry.async_update_device(device.id, new_identifiers={(DOMAIN, new)})
+        entities = er.async_get(self._hass)
+        for entity in er.async_entries_for_config_entry(entities, entry_id):
+            if entity.config_subentry_id == subentry_id:
+                entities.async_update_entity(
+                    entity.entity_id, new_unique_id=renamed(entity.unique_id)
+                )
 
     def _child(self, key: str) -> ChildDeviceEntry | None:
         return self._registry.async_get_child_device_by_identifier(
@@ -67,13 +108,13 @@ class BusDevices:
                 "sw_version": info.firmware,
                 "hw_version": info.hardware,
             }
-        elif not self.has(managed.subentry_id):
+        elif not self.has(managed.identity):
             # Otherwise the details read in an earlier run stay: it may be off.
             details = {"model": self._protocol_name}
         device = self._registry.async_get_or_create(
             config_entry_id=self._entry.entry_id,
             config_subentry_id=managed.subentry_id,
-            identifiers={(DOMAIN, managed.subentry_id)},
+            identifiers={(DOMAIN, managed.identity)},
             name=managed.subentry.title,
             via_device_id=self._bus_id,
             serial_number=(info and info.serial) or managed.charger.config.serial,
@@ -110,14 +151,14 @@ class BusDevices:
         """Remove the device of a port that is no longer used, with its entities."""
         if (
             managed.port_number is not None
-            and (child := self._child(managed.key)) is not None
+            and (child := self._child(managed.unique_key)) is not None
         ):
             self._registry.async_remove_device(child.id)
 
 
 def charger_info(managed: ManagedCharger) -> DeviceInfo:
     """Return the device info that links an entity to its charger."""
-    return DeviceInfo(identifiers={(DOMAIN, managed.subentry_id)})
+    return DeviceInfo(identifiers={(DOMAIN, managed.identity)})
 
 
 def connector_info(managed: ManagedCharger, number: int) -> ChildDeviceInfo:

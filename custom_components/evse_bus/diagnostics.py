@@ -67,11 +67,10 @@ async def async_get_device_diagnostics(
     coordinator = entry.runtime_data
     keys = {key for domain, key in device.identifiers if domain == DOMAIN}
     chargers = tuple(coordinator.chargers.values())
-    selected = [managed for managed in chargers if managed.key in keys] or [
+    selected = [managed for managed in chargers if managed.unique_key in keys] or [
         managed
         for managed in chargers
-        if managed.subentry_id == device.config_subentry_id
-        or managed.subentry_id in keys
+        if managed.subentry_id == device.config_subentry_id or managed.identity in keys
     ]
     if not selected:
         return await async_get_config_entry_diagnostics(hass, entry)

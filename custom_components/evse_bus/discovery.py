@@ -16,12 +16,12 @@ from homeassistant.helpers.start import async_at_started
 
 from .configuration import protocol_of
 from .const import CONF_PROTOCOL, DOMAIN
+from .identity import holder
 
 if TYPE_CHECKING:
     from homeassistant.config_entries import (
         ConfigEntry,
         ConfigFlowContext,
-        ConfigSubentry,
     )
     from homeassistant.core import HomeAssistant
 
@@ -45,11 +45,11 @@ def async_wants_to_connect(
         # Until it has started, Home Assistant would queue any number of flows.
         return
     protocol = protocol_of(entry.data)
-    unique_id = protocol.unique_id(found.serial)
+    identity = protocol.identity(found.serial)
     flows = hass.config_entries.flow.async_progress_by_handler(
         DOMAIN, include_uninitialized=True, match_context=dict(_DISCOVERED)
     )
-    if is_set_up(hass, unique_id) or len(flows) >= MOST_OFFERS:
+    if identity is None or holder(hass, identity) or len(flows) >= MOST_OFFERS:
         return
     discovery_flow.async_create_flow(
         hass,
@@ -61,7 +61,7 @@ def async_wants_to_connect(
             CONF_BOX: found,
         },
         # Home Assistant signals by this key when the box is no longer ignored.
-        discovery_key=DiscoveryKey(domain=DOMAIN, key=unique_id, version=1),
+        discovery_key=DiscoveryKey(domain=DOMAIN, key=identity, version=1),
     )
 
 
@@ -95,42 +95,28 @@ def async_follow_ignored(
     @callback
     def removed(ignored: ConfigEntry) -> None:
         for found in listener.unknown_boxes:
-            if protocol.unique_id(found.serial) == ignored.unique_id:
+            if protocol.identity(found.serial) == ignored.unique_id:
                 async_wants_to_connect(hass, entry, found)
 
     signal = signal_discovered_config_entry_removed(DOMAIN)
     return async_dispatcher_connect(hass, signal, removed)
 
 
-def is_set_up(
-    hass: HomeAssistant, unique_id: str, but: ConfigSubentry | None = None
-) -> bool:
-    """Return whether a box is set up, at this listener or any other bus.
-
-    ``but`` is the subentry being reconfigured.
-    """
-    return any(
-        subentry.unique_id == unique_id
-        for entry in hass.config_entries.async_entries(DOMAIN)
-        for subentry in entry.subentries.values()
-        if but is None or subentry.subentry_id != but.subentry_id
-    )
-
-
 # -- Ending discovery flows ------------------------------------------------------
 
 
 @callback
-def async_set_up_now(hass: HomeAssistant, subentry: ConfigSubentry) -> None:
+def async_set_up_now(hass: HomeAssistant, identity: str | None) -> None:
     """End the discovery flow of a box that was set up in another way."""
-    # Not at once: the flow that has just added the box ends by itself.
-    hass.loop.call_soon(_end_discovery, hass, subentry.unique_id)
+    if identity is not None:
+        # Not at once: the flow that has just added the box ends by itself.
+        hass.loop.call_soon(_end_discovery, hass, identity)
 
 
-def _end_discovery(hass: HomeAssistant, unique_id: str | None) -> None:
+def _end_discovery(hass: HomeAssistant, identity: str) -> None:
     manager = hass.config_entries.flow
     for flow in manager.async_progress_by_handler(
-        DOMAIN, match_context={**_DISCOVERED, "unique_id": unique_id}
+        DOMAIN, match_context={**_DISCOVERED, "unique_id": identity}
     ):
         with suppress(UnknownFlow):
             manager.async_abort(flow["flow_id"])

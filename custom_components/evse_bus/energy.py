@@ -12,7 +12,7 @@ of their own, written once `STEP` is new, at most once in `INTERVAL`, and at sto
 
 import asyncio
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isfinite
 from typing import Any, Final
 
@@ -22,7 +22,7 @@ from homeassistant.util.hass_dict import HassKey
 from .const import DOMAIN, LOGGER
 from .evse.listeners import Observable
 from .evse.meter import HIGHEST_CURRENT, most_energy
-from .storage import UNREADABLE, PlannedWrite, StoredFile
+from .stores.file import UNREADABLE, PlannedWrite, StoredFile
 
 TOTALS_KEY: Final = f"{DOMAIN}.totals"
 """File name in the storage folder of Home Assistant."""
@@ -41,8 +41,8 @@ class MeterRecord:
 
     total: float
     """Wh"""
-    meter: float
-    """Value of the meter that belongs to it, Wh."""
+    meter: float | None
+    """Value of the meter that belongs to it, Wh; ``None``: that of another meter."""
     wall: float
     """Wall-clock time of that value, s since 1970."""
     monotonic: float | None = None
@@ -95,8 +95,9 @@ class MeterTotal:
         ``current``: the highest phase current behind the meter, A.
         """
         total = self.total
-        if self._generation is None and self._stored is not None:
-            self._gap = meter - self._stored.meter
+        stored = self._stored
+        if self._generation is None and stored and stored.meter is not None:
+            self._gap = meter - stored.meter
             self._began = clocks.monotonic
         offset = self._offsets.get(generation)
         if offset is None:
@@ -225,9 +226,19 @@ class TotalStore(Observable):
         ):
             self._write_soon()
 
-    async def async_forget(self, prefix: str) -> None:
-        """Delete the totals whose keys begin with this."""
-        keys = [key for key in self._records if key.startswith(prefix)]
+    async def async_hand_over(self, old: str, new: str) -> None:
+        """Continue the totals of a box with the meters of the one that replaces it."""
+        await self.async_load()
+        for key, record in tuple(self._records.items()):
+            if key.startswith(f"{old}_"):
+                self._records[f"{new}{key.removeprefix(old)}"] = replace(
+                    record, meter=None
+                )
+        await self.async_flush()
+
+    async def async_forget(self, identity: str) -> None:
+        """Delete the totals of a box."""
+        keys = [key for key in self._records if key.startswith(f"{identity}_")]
         for key in keys:
             del self._records[key]
         if keys:
@@ -267,10 +278,10 @@ TOTALS: Final[HassKey[TotalStore]] = HassKey(TOTALS_KEY)
 
 
 def _offset(record: MeterRecord) -> float:
-    return record.total - record.meter
+    return record.total - (record.meter or 0.0)
 
 
-def encode(record: MeterRecord) -> dict[str, float]:
+def encode(record: MeterRecord) -> dict[str, float | None]:
     """Return the stored form of a record; a monotonic time ends with its run."""
     return {"total": record.total, "meter": record.meter, "wall": record.wall}
 
@@ -280,13 +291,12 @@ def decode(stored: Mapping[str, Any]) -> MeterRecord:
 
     Raises TypeError, KeyError or ValueError for a record of another shape.
     """
-    values = [stored[name] for name in ("total", "meter", "wall")]
-    for value in values:
+    total, meter, wall = (stored[name] for name in ("total", "meter", "wall"))
+    for value in (total, wall, 0.0 if meter is None else meter):
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             message = f"{value!r} is no number"
             raise TypeError(message)
         if not isfinite(value):
             message = f"{value!r} is not finite"
             raise ValueError(message)
-    total, meter, wall = values
     return MeterRecord(total, meter, wall)

@@ -6,6 +6,7 @@ busy bus repeat the previous values.
 
 from abc import abstractmethod
 from collections.abc import Callable, Hashable, Iterable
+from functools import partial
 from typing import Final, Protocol, override
 
 from homeassistant.config_entries import ConfigEntryState
@@ -73,7 +74,7 @@ def add_charger_entities(
             # The bus still polls while the platforms are being unloaded.
             return
         for key in obsolete(managed):
-            unique_id = f"{managed.key}_{key}"
+            unique_id = f"{managed.unique_key}_{key}"
             managed.added_entities.discard((domain, unique_id))
             if known := registry.async_get_entity_id(domain, DOMAIN, unique_id):
                 registry.async_remove(known)
@@ -180,7 +181,7 @@ class ChargerEntity(EvseBusEntity):
         """Attach the entity to the charger's device; ``of_box``: to that of its box."""
         super().__init__(coordinator, context or (managed.key, None), description)
         self.managed = managed
-        owner = managed.subentry_id if of_box else managed.key
+        owner = managed.identity if of_box else managed.unique_key
         self._attr_unique_id = f"{owner}_{description.key}"
         self._attr_device_info = (
             connector_info(managed, managed.port_number)
@@ -189,6 +190,13 @@ class ChargerEntity(EvseBusEntity):
             and not of_box
             else charger_info(managed)
         )
+
+    @override
+    async def async_added_to_hass(self) -> None:
+        """Register with the charger, which may be replaced by another box."""
+        await super().async_added_to_hass()
+        self.managed.entities.add(self)
+        self.async_on_remove(partial(self.managed.entities.discard, self))
 
     @property
     def charger(self) -> Charger:

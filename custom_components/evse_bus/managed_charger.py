@@ -6,6 +6,7 @@ from typing import Final
 
 from homeassistant.config_entries import ConfigSubentry
 from homeassistant.core import CALLBACK_TYPE
+from homeassistant.helpers.entity import Entity
 
 from .configuration import port_count
 from .const import LOGGER
@@ -14,6 +15,7 @@ from .evse.charger import Charger
 from .evse.errors import EvseError
 from .evse.events import Events
 from .evse.readings import ConnectorReading
+from .identity import identity_of
 
 SHUTDOWN_TIMEOUT: Final = 5.0
 """Longest time a charger may delay the stop of Home Assistant, s."""
@@ -32,7 +34,9 @@ class ManagedCharger:
     ) -> None:
         """Start without connectors, entities or subscriptions."""
         self.key = charger.config.key
-        """Prefix of its unique ids; its key in listener contexts."""
+        """Its key in listener contexts, as long as it is configured."""
+        self.identity = identity_of(subentry)
+        """What its box is known by; identifies the device of the box."""
         self.order_key = order_key
         """Key of its stored orders."""
         self.subentry_id = subentry.subentry_id
@@ -47,6 +51,8 @@ class ManagedCharger:
         """Each connector or port has a device of its own below that of the box."""
         self.added_entities: set[tuple[str, str]] = set()
         """Platform and unique id of each entity added so far."""
+        self.entities: set[Entity] = set()
+        """Entities that Home Assistant has added."""
         self.connectors: dict[int, ConnectorReading] = {}
         """Readings last passed to the listeners; empty while it is unavailable."""
         self.connector_numbers: set[int] = set()
@@ -57,6 +63,13 @@ class ManagedCharger:
         """Events of the charger; subscriptions survive a replaced `charger`."""
         self.subscriptions: list[CALLBACK_TYPE] = []
         """Callbacks that end the subscriptions to `charger` and `bus`."""
+
+    @property
+    def unique_key(self) -> str:
+        """Return the prefix of its unique ids, which identifies its device."""
+        if self.port_number is None:
+            return self.identity
+        return self.connector_key(self.port_number)
 
     @property
     def name(self) -> str:
@@ -75,7 +88,7 @@ class ManagedCharger:
 
     def connector_key(self, number: int) -> str:
         """Return the prefix of a connector's device identifier and unique ids."""
-        return f"{self.subentry_id}_{number}"
+        return f"{self.identity}_{number}"
 
     def connector(self, number: int) -> ConnectorReading | None:
         """Return a connector's current reading; ``None``: not available."""
@@ -94,6 +107,11 @@ class ManagedCharger:
             if not unique_id.startswith(prefix)
         }
         self.structure = None
+
+    async def async_remove_entities(self) -> None:
+        """Remove its entities; they stay registered."""
+        for entity in tuple(self.entities):
+            await entity.async_remove()
 
     def unsubscribe(self) -> None:
         """End all subscriptions to the charger and its bus."""

@@ -84,7 +84,8 @@ def _target(
     ports = [
         (managed, managed.charger)
         for managed in coordinator.chargers.values()
-        if {managed.key, managed.subentry_id} & keys and has_actions(managed.charger)
+        if {managed.unique_key, managed.identity} & keys
+        and has_actions(managed.charger)
     ]
     if not ports:
         raise wrong_action(ActionError.NOT_EWS_BOX, device=_name(device))

@@ -11,7 +11,7 @@ from typing import Final
 from .evse.errors import RefusedOrderError
 from .evse.model import Circuit
 from .evse.safety import number, round_down
-from .orders import OrderStore, SupplyOrder
+from .stores.orders import OrderStore, SupplyOrder
 
 STEP: Final = 0.1
 """Resolution of the shared current, A."""

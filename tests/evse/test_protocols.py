@@ -56,13 +56,16 @@ def test_protocols_of_a_make_are_chosen_from_a_menu() -> None:
             assert bool(protocol.make.plural) or not protocol.dials_in
 
 
-def test_unique_ids() -> None:
-    abl = PROTOCOLS["abl"]
-    assert abl.unique_id("2W22", 3) == "abl_2W22"
-    assert abl.unique_id(None, 3) == "abl_address_3"
+def test_a_box_is_known_by_its_serial_number() -> None:
+    assert PROTOCOLS["abl"].identity("2W22") == "abl_2W22"
+    for blank in (None, "", "  ", "00000000"):
+        assert PROTOCOLS["abl"].identity(blank) is None
     # The same boxes, reached in two ways.
-    assert PROTOCOLS["ews_network"].unique_id("728193645508") == "ews_728193645508"
-    assert PROTOCOLS["ews_network"].unique_id(None, "x") == "ews_network_address_x"
+    for key in ("ews", "ews_network"):
+        assert PROTOCOLS[key].identity("728193645508") == "ews_728193645508"
+    # Of 16 bits.
+    for key in ("smartevse", "smartevse_master"):
+        assert PROTOCOLS[key].identity("4711") is None
 
 
 # -- Addresses -------------------------------------------------------------------

@@ -118,6 +118,8 @@ class Protocol[C: ChargerConfig = Any]:
 
     serials: SerialNumbers
     """Serial numbers in frames."""
+    serial_identifies: bool = True
+    """No two boxes have the same serial number."""
     serial_family: str | None = None
     """Common to all protocols by which the same boxes can be reached: a serial number
     is set up only once among them. ``None``: no other protocol reaches them."""
@@ -130,10 +132,13 @@ class Protocol[C: ChargerConfig = Any]:
         """Return whether boxes dial: there is a listener and no port."""
         return self.listener is not None
 
-    def unique_id(self, serial: str | None, address: int | str | None = None) -> str:
-        """Return a unique id of a charger: by its serial number, else its address."""
-        if serial is None:
-            return f"{self.key}_address_{address}"
+    def identity(self, serial: str | None) -> str | None:
+        """Return what a box is known by on any bus; ``None``: no usable serial number.
+
+        Blanks and zeros are those of a box that was never given a number.
+        """
+        if not self.serial_identifies or not (serial or "").strip(" 0"):
+            return None
         return f"{self.serial_family or self.key}_{serial}"
 
     def bus(

@@ -44,7 +44,7 @@ from ..const import (
     SUBENTRY_CHARGER,
 )
 from ..coordinator import EvseBusConfigEntry
-from ..discovery import CONF_BOX, CONF_ENTRY, is_set_up
+from ..discovery import CONF_BOX, CONF_ENTRY
 from ..evse.errors import (
     EvseError,
     LineError,
@@ -54,6 +54,7 @@ from ..evse.errors import (
 )
 from ..evse.protocols import PROTOCOLS
 from ..evse.scan import FoundCharger
+from ..identity import holder
 from .address import Errors
 from .charger import Candidate
 from .steps import ChargerSteps
@@ -271,13 +272,13 @@ class ListenerSteps(ChargerSteps[ConfigFlowContext, ConfigFlowResult, str], Conf
         """Offer a box that has dialled and is not set up."""
         box: UnknownBox = discovery_info[CONF_BOX]
         self.protocol = PROTOCOLS[discovery_info[CONF_PROTOCOL]]
-        unique_id = self.protocol.unique_id(box.serial)
-        await self.async_set_unique_id(unique_id)
+        identity = self.protocol.identity(box.serial)
+        await self.async_set_unique_id(identity)
         # An ignored box is such an entry, too.
         self._abort_if_unique_id_configured()
         entry = self.hass.config_entries.async_get_entry(discovery_info[CONF_ENTRY])
-        if is_set_up(self.hass, unique_id):
-            return self.async_abort(reason="box_already_set_up")
+        if (other := holder(self.hass, identity)) is not None:
+            return self.abort_held(other)
         if entry is None:
             return self.async_abort(reason="listener_gone")
         self._listener = entry
@@ -321,16 +322,15 @@ class ListenerSteps(ChargerSteps[ConfigFlowContext, ConfigFlowResult, str], Conf
         entry = self._listener
         if entry is None or entry not in entries.async_entries(DOMAIN):
             return self.async_abort(reason="listener_gone")
-        unique_id = box["unique_id"]
-        if unique_id is not None and is_set_up(self.hass, unique_id):
-            return self.async_abort(reason="box_already_set_up")
+        if (other := self.find_held()) is not None:
+            return self.abort_held(other)
         entries.async_add_subentry(
             entry,
             ConfigSubentry(
                 data=MappingProxyType(dict(box["data"])),
                 subentry_type=SUBENTRY_CHARGER,
                 title=box["title"],
-                unique_id=unique_id,
+                unique_id=box["unique_id"],
             ),
         )
         return self.async_abort(

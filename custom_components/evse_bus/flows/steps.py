@@ -12,10 +12,11 @@ from homeassistant.data_entry_flow import FlowContext, FlowHandler, FlowResult
 from ..configuration import line_settings
 from ..connections import connection_name
 from ..const import CONF_INSTALLATION_LIMIT, SUBENTRY_CHARGER
-from ..discovery import is_set_up
 from ..evse.scan import Address, ScanResult
+from ..identity import Holder, holder, identity_data
 from .address import Errors, manual_form, typed_addresses
 from .charger import (
+    NO,
     Candidate,
     charger_data,
     charger_form,
@@ -75,6 +76,8 @@ class ChargerSteps[
         self._result = ScanResult()
         self._error: str | None = None
         self._pending: list[Candidate] = []
+        self.held_by = NO
+        """Where a box is set up already that was typed in, for texts."""
 
     def add_step(self, step_id: str, step: Step[ResultT]) -> str:
         """Add a step whose texts are those of one protocol; return its id.
@@ -166,8 +169,19 @@ class ChargerSteps[
         return "unreadable" if self._result.unreadable else "nothing_found"
 
     def _new(self) -> list[FoundCharger]:
-        taken = self.taken()
-        return [one for one in self._result.found if one.address not in taken]
+        return [one for one in self._result.found if self._holder_of(one) is None]
+
+    def _holder_of(self, found: FoundCharger) -> str | None:
+        """Return where a charger is set up already, or another at its address."""
+        if (other := self.holder(found.serial)) is not None:
+            return other.name
+        titles = {one.data[CONF_ADDRESS]: one.title for one in self.others()}
+        return titles.get(found.address)
+
+    def _held(self) -> str:
+        """Return where the chargers found are set up already, for texts."""
+        names = map(self._holder_of, self._result.found)
+        return ", ".join(name for name in names if name is not None) or NO
 
     def take_error(self) -> Errors:
         """Return the error of the step before this form, once."""
@@ -186,7 +200,7 @@ class ChargerSteps[
         user_input: dict[str, Any] | None = None,  # noqa: ARG002
     ) -> ResultT:
         """Report that only chargers answered that are set up already."""
-        return self._menu("nothing_new")
+        return self._menu("nothing_new", held=self._held())
 
     async def async_step_unreadable(
         self,
@@ -240,6 +254,7 @@ class ChargerSteps[
             "port": connection_name(self.bus_data),
             "protocol": self.protocol.name,
             "settings": str(line_settings(self.bus_data)),
+            "holder": self.held_by,
         }
 
     # -- Which chargers ----------------------------------------------------------
@@ -272,7 +287,7 @@ class ChargerSteps[
                 form, self.suggestions | (user_input or {})
             ),
             errors=errors,
-            description_placeholders=self.placeholders(),
+            description_placeholders=self.placeholders() | {"held": self._held()},
         )
 
     async def async_step_manual(
@@ -286,7 +301,7 @@ class ChargerSteps[
             return await self.async_begin([Candidate(address=form.any)])
         if user_input is not None:
             addresses, errors = typed_addresses(form, user_input, self.taken())
-            if any(self.is_elsewhere(one) for one in addresses):
+            if self.find_holder(map(form.serial, addresses)):
                 errors[form.key] = "box_already_set_up"
             if not errors:
                 found = {one.address: one for one in self._result.found}
@@ -325,6 +340,8 @@ class ChargerSteps[
                 if not self._pending:
                     return await self._async_confirm()
         candidate = self._pending[0]
+        if (other := self.holder(candidate.serial(self.protocol))) is not None:
+            return self.abort_held(other)
         address = self.protocol.address
         limit = self.suggestions.get(CONF_INSTALLATION_LIMIT, SUGGESTED_LIMIT)
         offered = {
@@ -354,18 +371,34 @@ class ChargerSteps[
         """Ask the same for a box with several ports, with texts of its own."""
         return await self.async_step_charger(user_input)
 
-    def is_elsewhere(self, address: Address, but: ConfigSubentry | None = None) -> bool:
-        """Return whether a box is set up already, by any protocol of its family.
+    def holder(self, serial: str | None) -> Holder | None:
+        """Return where a box is set up already, on this or any other bus."""
+        return holder(self.hass, self.protocol.identity(serial))
+
+    def find_holder(
+        self, serials: Iterable[str | None], but: ConfigSubentry | None = None
+    ) -> bool:
+        """Return whether one of some boxes is set up already; name it in the texts.
 
         ``but`` is the subentry being reconfigured.
         """
-        protocol = self.protocol
-        serial = protocol.address.serial(address)
-        return (
-            protocol.serial_family is not None
-            and serial is not None
-            and is_set_up(self.hass, protocol.unique_id(serial), but)
+        identities = map(self.protocol.identity, serials)
+        found = (holder(self.hass, one, but) for one in identities)
+        other = next(filter(None, found), None)
+        self.held_by = NO if other is None else other.name
+        return other is not None
+
+    def abort_held(self, other: Holder) -> ResultT:
+        """Abort: the box is set up already, perhaps by another flow just now."""
+        return self.async_abort(
+            reason="box_already_set_up",
+            description_placeholders={"holder": other.name},
         )
+
+    def find_held(self) -> Holder | None:
+        """Return where one of the new boxes was set up while this flow was open."""
+        found = (holder(self.hass, one["unique_id"]) for one in self.ready)
+        return next(filter(None, found), None)
 
     def _take_charger(self, candidate: Candidate, typed: dict[str, Any]) -> Errors:
         others = self.others()
@@ -382,18 +415,16 @@ class ChargerSteps[
             if addresses:
                 candidate = Candidate(address=addresses[0])
         serial = candidate.serial(self.protocol)
-        identity = self.protocol.unique_id(serial, candidate.address)
-        if identity in {one.unique_id for one in others}:
-            errors["base"] = "already_configured"
-        if self.is_elsewhere(candidate.address):
+        if self.find_holder([serial]):
             errors["base"] = "box_already_set_up"
         if not errors:
+            data = charger_data(self.protocol, candidate.address, serial, typed)
             self.ready.append(
                 ConfigSubentryData(
-                    data=charger_data(self.protocol, candidate.address, serial, typed),
+                    data=data | identity_data(self.protocol, serial),
                     subentry_type=SUBENTRY_CHARGER,
                     title=typed[CONF_NAME].strip(),
-                    unique_id=identity,
+                    unique_id=self.protocol.identity(serial),
                 )
             )
         return errors

@@ -18,12 +18,14 @@ from ..connections import Connections, ListenerConnections
 from ..const import (
     CONF_FAIL_SAFE_CURRENT,
     CONF_FAIL_SAFE_TIMEOUT,
+    CONF_IDENTITY,
     CONF_INSTALLATION_LIMIT,
     CONF_SERIAL,
     SUBENTRY_CHARGER,
 )
 from ..evse.errors import NotAvailableError
 from ..evse.scan import Address, ScanResult
+from ..identity import another_identity, kept_identity
 from .address import Errors, typed_addresses
 from .charger import (
     charger_data,
@@ -123,6 +125,8 @@ class ChargerSubentryFlow(
             return self.async_abort(reason=self._full_reason)
         if charger["data"][CONF_ADDRESS] in self.taken():
             return self.async_abort(reason="already_configured")
+        if (other := self.find_held()) is not None:
+            return self.abort_held(other)
         return self.async_create_entry(
             title=charger["title"],
             data=charger["data"],
@@ -149,19 +153,17 @@ class ChargerSubentryFlow(
             if not errors:
                 [address] = addresses
                 serial = self._serial(address, user_input)
-                identity = self.protocol.unique_id(serial, address)
-                if identity in {one.unique_id for one in others}:
-                    errors["base"] = "already_configured"
-                elif self.is_elsewhere(address, but=subentry):
+                if self.find_holder([serial], but=subentry):
                     errors["base"] = "box_already_set_up"
                 else:
                     data = charger_data(self.protocol, address, serial, user_input)
+                    identity = self._identity(subentry, serial)
                     return self.async_update_and_abort(
                         entry,
                         subentry,
-                        unique_id=identity,
+                        unique_id=identity.get(CONF_IDENTITY),
                         title=user_input[CONF_NAME].strip(),
-                        data=data | _fail_safe(subentry.data, data),
+                        data=data | identity | _fail_safe(subentry.data, data),
                     )
         return self.async_show_form(
             step_id="reconfigure" if self.protocol.ports == 1 else "reconfigure_box",
@@ -170,7 +172,7 @@ class ChargerSubentryFlow(
                 user_input or charger_suggestions(self.protocol, subentry),
             ),
             errors=errors,
-            description_placeholders={"name": subentry.title},
+            description_placeholders={"name": subentry.title, "holder": self.held_by},
         )
 
     async def async_step_reconfigure_box(
@@ -178,6 +180,13 @@ class ChargerSubentryFlow(
     ) -> SubentryFlowResult:
         """Change the same of a box with several ports, with texts of its own."""
         return await self.async_step_reconfigure(user_input)
+
+    def _identity(self, subentry: ConfigSubentry, serial: str | None) -> dict[str, str]:
+        """Return the identity: that of another box, if the serial number changes."""
+        before: str | None = subentry.data.get(CONF_SERIAL)
+        if before is None or serial == before:
+            return kept_identity(subentry)
+        return another_identity(self.protocol, serial)
 
     def _serial(self, address: Address, typed: dict[str, Any]) -> str | None:
         form = self.protocol.address

@@ -23,6 +23,7 @@ SETTINGS: Final = LineSettings(baudrate=9600)
 _MAKE: Final = Make(key="smartevse", name="SmartEVSE", menu="mode")
 
 _WORD: Final = 0xFFFF
+"""Only later firmware has a serial number, of 16 bits: two boxes may have the same."""
 
 
 def _word(serial: str) -> bytes:
@@ -54,6 +55,7 @@ POLLED: Final = Protocol(
     options=(Toggle(name="stop_on_shutdown", prominent=True),),
     lifetime_is_fail_safe=True,
     serials=_SERIALS,
+    serial_identifies=False,
 )
 
 MASTER: Final = Protocol(
@@ -81,6 +83,7 @@ MASTER: Final = Protocol(
     # Three boxes at most; the minimum as in the menu of a box (MIN).
     circuit=CircuitRange(highest=3 * MAXIMUM_CURRENT, highest_minimum=16),
     serials=_SERIALS,
+    serial_identifies=False,
 )
 
 __all__ = [

@@ -27,13 +27,13 @@ from homeassistant.core import (
 )
 from homeassistant.util.hass_dict import HassKey
 
-from .const import DOMAIN, LOGGER
-from .evse.errors import RefusedOrderError
-from .evse.listeners import Observable
-from .evse.model import ChargerConfig, CurrentLimit, Orders, Phases
-from .evse.protocol import Protocol
-from .evse.safety import cautious, number
-from .storage import UNREADABLE, PlannedWrite, StoredFile
+from ..const import DOMAIN, LOGGER
+from ..evse.errors import RefusedOrderError
+from ..evse.listeners import Observable
+from ..evse.model import ChargerConfig, CurrentLimit, Orders, Phases
+from ..evse.protocol import Protocol
+from ..evse.safety import cautious, number
+from .file import UNREADABLE, PlannedWrite, StoredFile
 
 ORDERS_KEY: Final = f"{DOMAIN}.orders"
 KNOWN_KEY: Final = f"{DOMAIN}.known_chargers"
@@ -127,22 +127,23 @@ def bus_key(entry_id: str) -> str:
 
 
 def charger_keys(
-    protocol: Protocol, subentry_id: str, config: ChargerConfig
+    protocol: Protocol, identity: str, config: ChargerConfig
 ) -> tuple[str, ...]:
     """Return the keys of a charger's orders: its own, then one it may have had before.
 
-    A charger is known by its subentry until its serial number has been read.
+    A charger that was added without a serial number has the orders of its serial
+    number as soon as that is read: it may have been set up before.
     """
     port = f"_{config.address}" if protocol.ports > 1 else ""
-    by_subentry = f"{_SUBENTRY}{subentry_id}{port}"
-    if config.serial is None:
+    by_subentry = f"{_SUBENTRY}{identity}{port}"
+    if (by_serial := protocol.identity(config.serial)) is None:
         return (by_subentry,)
-    return (f"{_SERIAL}{protocol.unique_id(config.serial)}{port}", by_subentry)
+    return (f"{_SERIAL}{by_serial}{port}", by_subentry)
 
 
-def subentry_keys(subentry_id: str, ports: int) -> list[str]:
+def subentry_keys(identity: str, ports: int) -> list[str]:
     """Return all keys that a charger without a serial number can have."""
-    key = f"{_SUBENTRY}{subentry_id}"
+    key = f"{_SUBENTRY}{identity}"
     return [key, *(f"{key}_{port}" for port in range(1, ports + 1))]
 
 
@@ -311,6 +312,28 @@ class OrderStore(Observable):
         )
         self._replace((keys[0], old_key), record)
         return record.order
+
+    def hand_over(self, owner: str, key: str, first: Orders, port: str = "") -> None:
+        """Give a box that replaces another its orders, not written yet.
+
+        ``first``: those of a new box. They are never higher than those of the box
+        before it, nor than those that it had itself. ``owner``: the subentry of both;
+        ``port``: the end of the keys of one port.
+        """
+        before = [
+            one
+            for one, record in self._records.items()
+            if record.owner == owner and one.endswith(port)
+        ]
+        found = [self._records[one] for one in {*before, key} if one in self._records]
+        order = reduce(cautious, [record.order for record in found], first)
+        for one in before:
+            # It keeps them for the time when it is used elsewhere.
+            self._records[one] = replace(self._records[one], owner="")
+        lost = any(one.lost for one in found)
+        self._records[key] = Record(order, owner, lost=lost)
+        self._known.add(key)
+        self._pending = True
 
     async def async_commit(self, key: str, order: Order) -> None:
         """Store an order: a lowering is on disk when this returns.

@@ -1,0 +1,103 @@
+"""What a box is known by, and where else it is set up.
+
+Unique ids, device identifiers, orders and totals stand on the identity of a box. It is
+fixed when the box is added: by its serial number, so that a box which is removed and
+added again, at whatever port and in whatever way, finds all of them again; else by the
+id of its subentry. A serial number that is read later does not change it.
+"""
+
+from typing import TYPE_CHECKING, NamedTuple
+
+from homeassistant.core import callback
+from homeassistant.util.ulid import ulid_now
+
+from .configuration import protocol_of
+from .const import CONF_IDENTITY, CONF_PROTOCOL, CONF_SERIAL, DOMAIN
+
+if TYPE_CHECKING:
+    from homeassistant.config_entries import ConfigEntry, ConfigSubentry
+    from homeassistant.core import HomeAssistant
+
+    from .evse.protocol import Protocol
+
+
+def identity_data(protocol: Protocol, serial: str | None) -> dict[str, str]:
+    """Return the identity of a new box as part of its subentry's data."""
+    identity = protocol.identity(serial)
+    return {} if identity is None else {CONF_IDENTITY: identity}
+
+
+def another_identity(protocol: Protocol, serial: str | None) -> dict[str, str]:
+    """Return the identity of a box that replaces another, as part of its data."""
+    return {CONF_IDENTITY: protocol.identity(serial) or ulid_now()}
+
+
+def kept_identity(subentry: ConfigSubentry) -> dict[str, str]:
+    """Return the identity of a box that is set up, as part of its data."""
+    stored = subentry.data
+    return {CONF_IDENTITY: stored[CONF_IDENTITY]} if CONF_IDENTITY in stored else {}
+
+
+def identity_of(subentry: ConfigSubentry) -> str:
+    """Return the identity of a box that is set up."""
+    identity: str = subentry.data.get(CONF_IDENTITY, subentry.subentry_id)
+    return identity
+
+
+def stands_on_serial(protocol: Protocol, subentry: ConfigSubentry) -> bool:
+    """Return whether the identity is that of the box itself: it may come back."""
+    return protocol.identity(subentry.data.get(CONF_SERIAL)) == identity_of(subentry)
+
+
+class Holder(NamedTuple):
+    """A subentry with which a box is set up."""
+
+    entry: ConfigEntry
+    subentry: ConfigSubentry
+
+    @property
+    def name(self) -> str:
+        """Return its name and that of its bus."""
+        return f"{self.subentry.title} ({self.entry.title})"
+
+
+@callback
+def holders(hass: HomeAssistant, identity: str) -> list[Holder]:
+    """Return all subentries with which a box is set up, the oldest first.
+
+    It may have been added by its serial number, or that was read later.
+    """
+    found = [
+        Holder(entry, subentry)
+        for entry in hass.config_entries.async_entries(DOMAIN)
+        # An ignored box is an entry, too, without data.
+        if CONF_PROTOCOL in entry.data
+        for subentry in entry.subentries.values()
+        if identity in _identities(protocol_of(entry.data), subentry)
+    ]
+    # The ids of subentries begin with the time.
+    return sorted(found, key=lambda one: (one.subentry.subentry_id, one.entry.entry_id))
+
+
+def _identities(protocol: Protocol, subentry: ConfigSubentry) -> set[str | None]:
+    return {identity_of(subentry), protocol.identity(subentry.data.get(CONF_SERIAL))}
+
+
+@callback
+def holder(
+    hass: HomeAssistant, identity: str | None, but: ConfigSubentry | None = None
+) -> Holder | None:
+    """Return where a box is set up already; ``None``: nowhere, or not known.
+
+    ``but`` is the subentry being reconfigured.
+    """
+    if identity is None:
+        return None
+    return next(
+        (
+            one
+            for one in holders(hass, identity)
+            if but is None or one.subentry.subentry_id != but.subentry_id
+        ),
+        None,
+    )
