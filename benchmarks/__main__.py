@@ -9,6 +9,7 @@ from typing import Final
 
 from . import (
     abl_scan,
+    byte_errors,
     evbox_bus,
     ews_events,
     ews_listener,
@@ -36,6 +37,7 @@ BENCHMARKS: Final = {
         ews_poll,
         ews_events,
         ews_listener,
+        byte_errors,
     )
 }
 

@@ -9,11 +9,10 @@ dials 127.0.0.1 asks for the fixture ``socket_enabled``; ptys are not blocked.
 """
 
 import asyncio
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 import sys
-from typing import Any
 from unittest.mock import PropertyMock, patch
 
 from homeassistant import runner
@@ -25,10 +24,9 @@ from syrupy.assertion import SnapshotAssertion
 # Home Assistant finds custom integrations by importing the package
 # custom_components. The test plugin has one of its own: ours must be first.
 import custom_components
-from custom_components.evse_bus.evse import line
 from custom_components.evse_bus.evse.protocols import PROTOCOLS
+from tests import simulated_ports
 from tests.simulated_time import SimulatedLoop
-from tests.virtual.ports import DirectPort
 
 assert Path(custom_components.__file__).parents[1] == Path(__file__).parents[1]
 
@@ -79,22 +77,10 @@ async def configure_event_loop() -> None:
 
 
 @pytest.fixture(autouse=True)
-def direct_ports(monkeypatch: pytest.MonkeyPatch) -> None:
+def direct_ports() -> Iterator[None]:
     """Let the library open the ports of virtual buses that live on its loop."""
-    serialx = line.create_serial_connection
-
-    async def connect[P: asyncio.Protocol](
-        loop: asyncio.AbstractEventLoop,
-        factory: Callable[[], P],
-        url: str,
-        **settings: Any,  # noqa: ANN401 - serialx' own
-    ) -> tuple[object, P]:
-        if (port := DirectPort.find(url)) is None:
-            return await serialx(loop, factory, url, **settings)
-        protocol = factory()
-        return port.open(protocol), protocol
-
-    monkeypatch.setattr(line, "create_serial_connection", connect)
+    with simulated_ports.direct_ports():
+        yield
 
 
 @pytest.fixture

@@ -52,8 +52,12 @@ class VirtualBus(LoopThread):
         seed: int = 0,
         ring: int | None = 20_000,
         own_thread: bool = True,
+        tick: float = TICK,
     ) -> None:
-        """Prepare a bus; `start` or `with` starts it."""
+        """Prepare a bus; `start` or `with` starts it.
+
+        `tick`: seconds between two steps of the devices, beside those for a request.
+        """
         super().__init__("virtual-bus", own_thread=own_thread)
         lines = {(d.baud, d.parity) for d in devices} or {(38400, "N")}
         if len(lines) > 1 and (baud is None or parity is None):
@@ -79,6 +83,7 @@ class VirtualBus(LoopThread):
         self._port: Port | None = None
         self._url = ""
         self._plugged = False
+        self._tick_time = tick
         self._ticker: asyncio.TimerHandle | None = None
         self._foreign: list[asyncio.TimerHandle] = []
         self._scale = time_scale
@@ -363,11 +368,11 @@ class VirtualBus(LoopThread):
         self._plugged = True
 
     def _tick(self) -> None:
-        self._ticker = self.loop.call_later(TICK, self._tick)
+        self._ticker = self.loop.call_later(self._tick_time, self._tick)
         self._step_devices()
         rate = self.faults.noise_rate
-        if rate and self.rng.random() < rate * TICK:
-            after = self.rng.random() * TICK
+        if rate and self.rng.random() < rate * self._tick_time:
+            after = self.rng.random() * self._tick_time
             data = bytes((self.rng.randrange(256),))
             self.wire.send(NOISE, data, self.time() + after)
         self.check_waiters()

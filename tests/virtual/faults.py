@@ -10,6 +10,8 @@ if TYPE_CHECKING:
     from random import Random
 
 Kind = Literal["lose", "late", "duplicate", "truncate", "corrupt", "replace", "noise"]
+Damage = Literal["flip", "replace", "drop", "insert"]
+DAMAGES: tuple[Damage, ...] = ("flip", "replace", "drop", "insert")
 
 
 @dataclass(slots=True)
@@ -17,11 +19,13 @@ class Faults:
     """Faults of one device, or of the whole bus (`bus.faults`).
 
     Rates are probabilities per reply, `byte_error_rate` per byte. All can be set at
-    any time from any thread. `echo` and `noise_rate` (bytes per second) count on the
+    any time from any thread. `damage`: what a byte error does, one at random: one bit
+    flips, another byte is in its place, it is lost, a byte comes before it. `echo` and `noise_rate` (bytes per second) count on the
     bus only; `dead` on the bus is a cut cable: no byte reaches any device.
     """
 
     byte_error_rate: float = 0.0
+    damage: tuple[Damage, ...] = ("flip",)
     lose_rate: float = 0.0
     late_rate: float = 0.0
     late_by: float = 0.5
@@ -74,18 +78,31 @@ class Faults:
         return replies
 
     def disturb(self, data: bytes, rng: Random) -> bytes:
-        """Flip bits at the byte error rate."""
+        """Damage bytes at the byte error rate; fewer or more may come out."""
         rate = self.byte_error_rate
         if not rate or rng.random() >= 1 - (1 - rate) ** len(data):
             return data
         # At least one byte is hit; the others keep their own chance.
         hit = rng.randrange(len(data))
-        damaged = bytearray(data)
-        for index in range(len(damaged)):
+        damaged = bytearray()
+        for index, byte in enumerate(data):
             if index == hit or rng.random() < rate:
-                damaged[index] ^= 1 << rng.randrange(8)
+                damaged += self._damaged(byte, rng)
                 self._count("byte_error")
+            else:
+                damaged.append(byte)
         return bytes(damaged)
+
+    def _damaged(self, byte: int, rng: Random) -> bytes:
+        """Return what is received in place of a byte."""
+        damage = self.damage[0] if len(self.damage) == 1 else rng.choice(self.damage)
+        if damage == "flip":
+            return bytes((byte ^ 1 << rng.randrange(8),))
+        if damage == "replace":
+            return bytes((byte ^ rng.randrange(1, 256),))
+        if damage == "drop":
+            return b""
+        return bytes((rng.randrange(256), byte))
 
     def _do(
         self,

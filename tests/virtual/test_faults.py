@@ -11,7 +11,7 @@ from tests.simulated_client import PortClient, living
 
 from .abl import AblBox
 from .bus import VirtualBus
-from .faults import Faults
+from .faults import Damage, Faults
 
 READ_FULL = b":0103002E0005C9\r\n"
 ANSWER = b">01030A2EA1110A03E803E803E847\r\n"
@@ -66,6 +66,35 @@ def test_corrupt_replaced_and_noisy_in_turn(line: Line) -> None:
     assert client.ask(READ_FULL) == b"hello\n"
     assert client.ask(READ_FULL) == b"\x00\xff" + ANSWER
     assert box.faults.happened == {"corrupt": 1, "replace": 1, "noise": 1}
+
+
+@pytest.mark.parametrize(
+    ("damage", "lengths"),
+    [("flip", {50}), ("replace", {50}), ("drop", {47, 48, 49}), ("insert", {51, 52})],
+)
+def test_kinds_of_byte_errors(damage: Damage, lengths: set[int]) -> None:
+    faults = Faults(byte_error_rate=0.01, damage=(damage,))
+    rng = Random(3)  # noqa: S311 - repeatable on purpose
+    results = [faults.disturb(bytes(50), rng) for _ in range(100)]
+    damaged = [data for data in results if data != bytes(50)]
+    assert 20 < len(damaged) < 60
+    assert {len(data) for data in damaged} & lengths
+    assert all(len(data) <= 50 for data in damaged) == (damage != "insert")
+    assert all(len(data) >= 50 for data in damaged) == (damage != "drop")
+
+
+def test_a_lost_byte_leaves_a_gap(line: Line) -> None:
+    """The bytes after it come when they would have come: the frame is only shorter."""
+    bus, box, client = line
+    client.write(READ_FULL)
+    bus.wait_for(lambda: len(bus.log) == 1)
+    bus.faults.damage = ("drop",)
+    bus.faults.byte_error_rate = 0.1
+    begin = bus.log.entries[0].end
+    received = client.read_line()
+    assert 20 < len(received) < 31
+    whole = len(ANSWER) * bus.byte_time + box.turn_round
+    assert client.time() - begin == pytest.approx(whole, abs=0.001)
 
 
 def test_dead_box_and_cut_cable(line: Line) -> None:

@@ -57,11 +57,13 @@ class Segment:
     data: bytes
     sources: tuple[str, ...]
     silence_before: float
+    lasts: float = 0.0
+    """How long the wire was in use, s; 0: for the time of its bytes."""
 
     @property
     def end(self) -> float:
         """Return the end of the last byte."""
-        return self.start + len(self.data) * self.byte_time
+        return self.start + (self.lasts or len(self.data) * self.byte_time)
 
 
 class Wire:
@@ -230,11 +232,11 @@ class Wire:
             complete = min(complete, alone)
         start = first.next_start
         if complete > 0:
-            data = first.data[first.position : first.position + complete]
+            sent = first.data[first.position : first.position + complete]
             first.position += complete
-            data = self.faults.disturb(data, self._rng)
+            data = self.faults.disturb(sent, self._rng)
             first.received += data
-            self._receive(start, data, (first.source,))
+            self._receive(start, data, (first.source,), complete * bt)
             return True
         self._collide(first, others, start)
         return True
@@ -260,21 +262,28 @@ class Wire:
                 transmission.collided = True
                 self.collisions += 1
         sources = tuple(sorted({t.source for t in together}))
-        self._receive(start, bytes((value,)), sources)
+        self._receive(start, bytes((value,)), sources, first.byte_time)
 
-    def _receive(self, start: float, data: bytes, sources: tuple[str, ...]) -> None:
+    def _receive(
+        self, start: float, data: bytes, sources: tuple[str, ...], lasts: float
+    ) -> None:
+        """Receive bytes for which the wire was in use so long, s.
+
+        A byte error may have removed bytes, or added some.
+        """
         silence = start - self._last_end
         # On two wires the other direction may already be further.
-        self._last_end = max(self._last_end, start + len(data) * self.byte_time)
+        self._last_end = max(self._last_end, start + lasts)
         self.bytes_carried += len(data)
         if sources != (CLIENT,) or self.faults.echo:
             self._to_client += data
         last = self._segments[-1] if self._segments else None
         if last is not None and last.sources == sources and silence < EPSILON:
             last.data += data
-        else:
+            last.lasts += lasts
+        elif data:
             self._segments.append(
-                Segment(start, self.byte_time, data, sources, silence)
+                Segment(start, self.byte_time, data, sources, silence, lasts)
             )
 
     def _log(self, transmission: Transmission) -> None:

@@ -28,6 +28,7 @@ from typing import Final, override
 from ..charger import Charger
 from ..errors import GarbledReplyError, ImplausibleReplyError, WrongChargerError
 from ..exchange import Turn
+from ..limit_monitor import LimitMonitor
 from ..model import (
     Capability,
     FailSafe,
@@ -56,7 +57,6 @@ from .frames import (
     encode_68,
     encode_69,
 )
-from .limit_monitor import LimitMonitor
 from .plausibility import AcceptedReply, Plausibility, used_currents
 from .readings import charger_info, connectors, same_serial, serial_number
 

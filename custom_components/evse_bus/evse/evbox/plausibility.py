@@ -20,6 +20,12 @@ from typing import Final
 from ..errors import ImplausibleReplyError
 from ..meter import CONFIRMATIONS, Total
 from ..model import MAXIMUM_CURRENT, MINIMUM_CURRENT, Phases
+from ..plausibility import (
+    CURRENT_AGREEMENT,
+    Agreement,
+    agree,
+    highest_plausible,
+)
 from .config import UNKNOWN_INTERVAL
 from .frames import ModuleReply, Reply
 from .meters import Meters, Totals
@@ -30,9 +36,6 @@ LONGEST_INTERVAL: Final = 600
 """Longest minimum interval, s (manual: 20, seen: 1)."""
 HIGHEST_VOLTAGE: Final = 300.0
 """Highest voltage of a phase, V; 0 is a phase that is not connected."""
-CURRENT_FACTOR: Final = 1.1
-CURRENT_OFFSET: Final = 1.0
-"""Used currents may be this much above the maximum of the connection, A."""
 
 
 class Quantity(StrEnum):
@@ -47,12 +50,11 @@ class Quantity(StrEnum):
     METER = "meter"
 
 
-_AGREEMENT: Final[Mapping[Quantity, tuple[float, float]]] = {
-    # Largest difference of two values: a share of the larger one, plus an amount.
+_AGREEMENT: Final[Mapping[Quantity, Agreement]] = {
     Quantity.MAXIMUM: (0.0, 0.0),
     Quantity.INTERVAL: (0.0, 0.0),
     Quantity.MINIMUM: (0.0, 0.0),
-    Quantity.CURRENT: (0.5, 1.0),
+    Quantity.CURRENT: CURRENT_AGREEMENT,
     Quantity.COS_PHI: (0.1, 0.05),
     Quantity.VOLTAGE: (0.1, 5.0),
 }
@@ -243,7 +245,7 @@ class Plausibility:
             maximum = max(maximum, self.maximum.agreed)
         elif reply.maximum_current <= LARGEST_CONNECTION:
             maximum = max(maximum, reply.maximum_current)
-        return maximum * CURRENT_FACTOR + CURRENT_OFFSET
+        return highest_plausible(maximum)
 
     def _is_confirmed(self, checked: _Checked, highest: float) -> bool:
         """Return whether enough replies agree with this one; else quarantine it."""
@@ -286,7 +288,7 @@ def _consistent(first: _Checked, second: _Checked, highest: float) -> bool:
     return all(
         first.totals[place[1] or 0].can_grow_to(second.totals[place[1] or 0], highest)
         if place[0] is Quantity.METER
-        else _agree(place[0], first.implausible[place], value)
+        else agree(first.implausible[place], value, _AGREEMENT[place[0]])
         for place, value in second.implausible.items()
         if place in common or place[0] is not Quantity.CURRENT
     )
@@ -298,8 +300,3 @@ def _over_currents(checked: _Checked) -> set[Place]:
 
 def _other_places(checked: _Checked) -> set[Place]:
     return set(checked.implausible) - _over_currents(checked)
-
-
-def _agree(quantity: Quantity, one: float, two: float) -> bool:
-    share, amount = _AGREEMENT[quantity]
-    return abs(one - two) <= amount + share * max(abs(one), abs(two))

@@ -1,6 +1,6 @@
 """Limits that a ChargePoint does not keep to."""
 
-from custom_components.evse_bus.evse.evbox.limit_monitor import LimitMonitor
+from custom_components.evse_bus.evse.limit_monitor import LimitMonitor
 
 
 def exceeds(monitor: LimitMonitor, now: float, *used: float) -> bool:

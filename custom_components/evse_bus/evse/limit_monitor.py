@@ -1,10 +1,10 @@
-"""Check that a ChargePoint keeps to the limits sent to it."""
+"""Check that a car keeps to the limits of the last seconds."""
 
 from collections import deque
 from math import inf
 from typing import Final
 
-from ..model import Phases
+from .model import Phases
 
 TOLERANCE_SHARE: Final = 0.05
 TOLERANCE: Final = 1.0
@@ -47,15 +47,19 @@ class LimitMonitor:
 
         True from the second such reading in a row.
         """
+        above = self.is_above(now, used, grace)
+        self._above = self._above + 1 if above else 0
+        return self._above >= READINGS
+
+    def is_above(self, now: float, used: Phases[float], grace: float) -> bool:
+        """Return whether these currents exceed every limit of the last ``grace`` s."""
         # The limit in force at the beginning of that time counts too.
         while len(self._limits) > 1 and self._limits[1][0] <= now - grace:
             self._limits.popleft()
         allowed = (
             max(limits[phase] for _, limits in self._limits) for phase in range(3)
         )
-        above = any(
+        return any(
             amperes > limit * (1 + TOLERANCE_SHARE) + TOLERANCE
             for amperes, limit in zip(used, allowed, strict=True)
         )
-        self._above = self._above + 1 if above else 0
-        return self._above >= READINGS

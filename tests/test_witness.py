@@ -1,0 +1,95 @@
+"""A witness finds what is wrong; benchmarks rely on it."""
+
+import asyncio
+
+import pytest
+
+from benchmarks.byte_errors import Case, case_figures, watch
+from benchmarks.simulated import simulate
+from benchmarks.watched import AblScene, EvboxScene, Scene
+from benchmarks.witness import History
+from custom_components.evse_bus.evse.errors import NotConfirmedError
+from custom_components.evse_bus.evse.model import OrderChange
+
+
+def test_a_value_that_was_true_in_the_window_is_right() -> None:
+    history = History(10.0)
+    history.add(0.0, "A1")
+    history.add(5.0, "B2")
+    history.add(6.0, "C2")
+    assert history.had("A1", 4.9)
+    assert not history.had("A1", 5.0)
+    assert history.had("C2", 100.0)
+
+
+def test_a_number_passes_through_all_between() -> None:
+    history = History(10.0)
+    history.add(0.0, 0.0)
+    history.add(1.0, 16.0)
+    assert history.had(7.5, 0.5)
+    assert history.had(16.05, 0.5)
+    assert not history.had(16.1, 0.5)
+    assert not history.had(0.0, 1.0)
+    assert not history.had(None, 0.0)
+
+
+def test_old_values_are_dropped() -> None:
+    history = History(10.0)
+    for at in range(100):
+        history.add(at, at)
+    assert history.had(90, 90.0)
+    assert not history.had(60, 0.0)
+
+
+def test_without_errors_nothing_is_wrong() -> None:
+    outcome = simulate(watch, Case("abl", AblScene, seconds=900, rate=0.0))
+    assert [found.notes for found in outcome.findings] == [[], []]
+    by_name = {one.name: one for one in case_figures("abl", outcome)}
+    assert all(one.met is not False for one in by_name.values())
+    assert by_name["abl: available"].value == 100
+    assert outcome.commands
+    assert not outcome.failed
+
+
+async def _run(scene: Scene, spoil: str) -> list[str]:
+    async with scene:
+        (witness, *_) = scene.witnesses
+        device = witness.box.device  # type: ignore[attr-defined]
+        await asyncio.sleep(60)
+        if spoil == "current":
+            # More than three replies agree: the library has to believe it.
+            device.distort(current=30.0, times=None)
+        elif spoil == "total":
+            device.distort(energy_jump=5.0, times=None)
+        elif spoil == "serial":
+            device.serial = "2W22xy99999999"
+            await scene.lose_port(5)
+        elif spoil == "limit":
+            device.outlet.car.plug_in()
+            device.outlet.ignore_limit = True
+            with pytest.raises(NotConfirmedError):
+                await scene.chargers[0].change_orders(OrderChange(current=6.0))
+        elif spoil == "keep-alive":
+            scene.virtual.unplug()
+        await asyncio.sleep(60)
+        found = witness.end()
+        return [
+            name
+            for name in ("wrong", "wrong_totals", "wrong_identities", "over", "missed")
+            if getattr(found, name)
+        ]
+
+
+@pytest.mark.parametrize(
+    ("make", "spoil", "expected"),
+    [
+        (EvboxScene, "current", "wrong"),
+        (EvboxScene, "total", "wrong_totals"),
+        (AblScene, "serial", "wrong_identities"),
+        (AblScene, "limit", "over"),
+        (AblScene, "keep-alive", "missed"),
+        (EvboxScene, "keep-alive", "missed"),
+    ],
+)
+def test_what_is_wrong_is_found(make: type[Scene], spoil: str, expected: str) -> None:
+    assert expected in simulate(_run, make(1), spoil)  # type: ignore[call-arg]
