@@ -110,10 +110,12 @@ class Scene:
         charger._config = replace(charger.config, poll_interval=FOREVER)
         await until(lambda: charger.slot.ready > FOREVER)
 
-    async def polled(self, charger: AblCharger, times: int = 2) -> None:
-        """Wait for polls that began after this call."""
+    async def polled(
+        self, charger: AblCharger, times: int = 2, patience: float = PATIENCE
+    ) -> None:
+        """Wait for polls that began after this call; a changed status is read twice."""
         reads = len(self.reads(charger.config.address)) + times
-        await until(lambda: len(self.reads(charger.config.address)) >= reads)
+        await until(lambda: len(self.reads(charger.config.address)) >= reads, patience)
         await asyncio.sleep(0)
 
     def requests(self) -> list[Request]:

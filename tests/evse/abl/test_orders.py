@@ -162,7 +162,7 @@ async def test_after_a_power_cycle_the_limit_is_reasserted_at_once() -> None:
         # No other exchange between the status above the limit and the write.
         registers = [one.register for one in scene.requests() if one.device_id == 1]
         second = len(registers) - 1 - registers[::-1].index(LIMIT)
-        assert registers[second - 1 : second + 3] == [0x0F, LIMIT, 0x2E, 0x0F]
+        assert registers[second - 1 : second + 3] == [0x0F, LIMIT, 0x2E, 0x2E]
 
 
 async def test_after_a_power_cycle_a_pause_is_reasserted_too() -> None:

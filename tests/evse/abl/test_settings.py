@@ -49,8 +49,8 @@ async def test_refused_settings_leave_the_set_up_mode() -> None:
     async with Scene(box) as scene:
         charger = await scene.settled(config(), orders())
         await scene.stop_polls(charger)
-        # The status and Icmax, E2, both again, and the settings.
-        answers(box, *["good"] * 5, b">0190046B\r\n")
+        # Status and Icmax, E2, the changed status twice, Icmax, and the settings.
+        answers(box, *["good"] * 6, b">0190046B\r\n")
         with pytest.raises(EvseError, match="exception 4"):
             await charger.command(Command.SET_UPSTREAM_TIMEOUT, value=True)
         assert scene.writes() == [E2, 0xB001, A1]

@@ -285,7 +285,8 @@ class AblCharger(AblReader):
                 patience=WRITE_PAUSES[0] if failed else FAILED_AFTER,
             )
             by_limit = self.effective_orders.allowed is not False
-            if self.setpoint.paused and by_limit and not was_paused:
+            # The orders may have changed since.
+            if self.writes.code == PAUSE and by_limit and not was_paused:
                 await self.note_pause(by_limit=True)
 
     # -- Commands ----------------------------------------------------------------

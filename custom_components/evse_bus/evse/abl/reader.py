@@ -5,7 +5,7 @@ anything else is exchanged (PROTOCOLS.md, 2).
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, repeat
 from math import inf
 from typing import ClassVar, Final, override
@@ -36,7 +36,8 @@ from .decisions import (
     decide,
     is_charging,
 )
-from .duty import PAUSE, highest_current
+from .duty import PAUSE, current_for, highest_current
+from .plausibility import MOST_READS, StatusCheck, agreeing
 from .readings import (
     EnergyEstimate,
     Snapshot,
@@ -59,6 +60,7 @@ from .registers import (
     Icmax,
     Info,
     Reading,
+    Serial,
     StateCode,
     limit_duty,
     read_answer,
@@ -84,6 +86,8 @@ ICMAX_PROBES: Final = 3
 ICMAX_ABSENT: Final = 600.0
 """Time after which that is tried again, s."""
 
+SHORTEST_GRACE: Final = 15.0
+"""A car may draw more than a new limit for this long, or longer, s."""
 STILL_CHARGING: Final = 30.0
 """A box that measures no current, and is in C for so long after its pause, has not
 followed it, s."""
@@ -164,7 +168,10 @@ class AblReader(Charger[AblConfig]):
         self._icmax_at = -inf
         self._icmax_due = -inf
         self._icmax_silent = 0
+        self._limits: Icmax | None = None
+        """Contents of 0x000F, as read last from this box."""
         self._default: int | None = None
+        self._check = StatusCheck()
         self._status_at = 0.0
         self._charging_since = inf
         self._state: int | None = None
@@ -192,8 +199,9 @@ class AblReader(Charger[AblConfig]):
     @property
     @override
     def exchanges_per_turn(self) -> int:
-        # Identity (info, serial twice), status, Icmax, limit, status and Icmax twice.
-        return 11
+        # Identity (info, serial, each twice), status three times, Icmax twice, limit,
+        # status and Icmax twice.
+        return 14
 
     # -- Identity ----------------------------------------------------------------
 
@@ -207,7 +215,8 @@ class AblReader(Charger[AblConfig]):
         self._identified = False
         self._flags = None
         self._flags_due = 0.0
-        self._icmax = None
+        self._icmax = self._limits = None
+        self._check = StatusCheck()
         self.reports_icmax = None
         self._forget()
         self._energy.interrupt()
@@ -243,9 +252,9 @@ class AblReader(Charger[AblConfig]):
         if self._identified:
             return
         address = self.config.address
-        info = await read(turn, address, INFO)
-        serial = await self._read_serial(turn)
+        info = await self._read_agreed(turn, INFO, self._info)
         expected = self.config.serial or self._serial
+        serial = await self._read_serial(turn, expected)
         if expected is not None and serial != expected:
             self.notice(Fault.WRONG_CHARGER, present=True)
             found = serial or "no serial number"
@@ -254,7 +263,7 @@ class AblReader(Charger[AblConfig]):
             raise WrongChargerError(message, expected=expected, found=found)
         self.notice(Fault.WRONG_CHARGER, present=False)
         if serial != self._serial:
-            self._default = None
+            self._default = self._limits = None
         self._serial = serial
         self._info = info
         if serial and self.orders.remembered.get(REPORTS_ICMAX) == serial:
@@ -263,10 +272,10 @@ class AblReader(Charger[AblConfig]):
         self._identified = True
         self.info = charger_info(info, serial, self._flags)
 
-    async def _read_serial(self, turn: Turn) -> str | None:
+    async def _read_serial(self, turn: Turn, expected: str | None) -> str | None:
         """Return the serial number; ``None`` from a box that has none.
 
-        The manual shows 0x0050 in an example only. Where no serial number is
+        Another than expected counts when two replies agree. The manual shows 0x0050 in an example only. Where no serial number is
         expected, silence means that there is no such register.
         """
         try:
@@ -277,7 +286,9 @@ class AblReader(Charger[AblConfig]):
             if self.config.serial is not None or self._serial is not None:
                 raise
             return None
-        return serial.number
+        known = None if expected is None else Serial(number=expected)
+        agreed = await self._read_agreed(turn, SERIAL, known, first=serial)
+        return agreed.number
 
     # -- Status, flags, Icmax ----------------------------------------------------
 
@@ -286,7 +297,7 @@ class AblReader(Charger[AblConfig]):
 
         The flags are due every `FLAGS_INTERVAL`, and when the status has changed.
         """
-        status = await read(turn, self.config.address, READING)
+        status = await self._read_reading(turn)
         await self.read_icmax(turn)
         last = self.last_status
         if (
@@ -300,10 +311,70 @@ class AblReader(Charger[AblConfig]):
 
     async def read_status(self, turn: Turn) -> Reading:
         """Read the status in the midst of a conversation, and keep it."""
-        status = await read(turn, self.config.address, READING, attempts=2)
+        status = await self._read_reading(turn, attempts=2)
         await self.read_icmax(turn)
         self.keep_status(status, turn.now)
         return status
+
+    async def _read_reading(self, turn: Turn, *, attempts: int = 1) -> Reading:
+        """Read 0x002E until enough replies agree (see `StatusCheck`)."""
+        address = self.config.address
+        replies: list[Reading] = []
+        for _ in range(MOST_READS):
+            reading = await read(turn, address, READING, attempts=attempts)
+            # It is awake.
+            attempts = 2
+            if replies and not agreeing(replies[-1], reading):
+                self.statistics.implausible += len(replies)
+                replies.clear()
+            replies.append(reading)
+            needed = self._check.needed(
+                reading, turn.now, maximum=self._maximum, grace=self._grace
+            )
+            if len(replies) >= needed:
+                return reading
+        raise self._disagreement()
+
+    async def _read_agreed[T](
+        self,
+        turn: Turn,
+        registers: Registers[T],
+        known: T | None,
+        *,
+        first: T | None = None,
+    ) -> T:
+        """Read a block; other contents than known ones count when two replies agree.
+
+        ``first``: the reply to a read just before.
+        """
+        address = self.config.address
+        contents = await read(turn, address, registers) if first is None else first
+        for _ in range(MOST_READS - 1):
+            if contents == known:
+                return contents
+            again = await read(turn, address, registers, attempts=2)
+            if again == contents:
+                return contents
+            self.statistics.implausible += 1
+            contents = again
+        raise self._disagreement()
+
+    def _disagreement(self) -> GarbledReplyError:
+        """Return the error for replies that do not agree: perhaps of two boxes."""
+        return GarbledReplyError(f"{self.config.name}: replies that do not agree")
+
+    @property
+    def _maximum(self) -> float:
+        """Return the highest current that can be meant, A.
+
+        The rated one, reported by the box, else that of the wiring.
+        """
+        rated = None if self._limits is None else highest_current(self._limits.rated)
+        return self.config.installation_limit if rated is None else rated
+
+    @property
+    def _grace(self) -> float:
+        return max(SHORTEST_GRACE, FOLLOW_TIME + self.config.poll_interval)
 
     def keep_status(self, status: Reading, now: float) -> None:
         """Keep a status read at a loop time (s), and make the reading of it."""
@@ -322,6 +393,13 @@ class AblReader(Charger[AblConfig]):
             paused=decision.paused,
             offered=decision.offered,
         )
+        offered = None if decision.offered is None else current_for(decision.offered)
+        self._check.keep(
+            status, now, offered=offered, maximum=self._maximum, grace=self._grace
+        )
+        self.notice(Fault.OVERCURRENT, present=self._check.over_current)
+        exceeded = self._check.limit_exceeded and not decision.paused
+        self.notice(Fault.LIMIT_EXCEEDED, present=exceeded)
         currents = phase_currents(snapshot, self.config.phase_order)
         power = power_of(currents, self.config.voltage)
         self._energy.add(power, now)
@@ -383,7 +461,7 @@ class AblReader(Charger[AblConfig]):
             self.reports_icmax = None
             self._icmax_silent = 0
         try:
-            icmax = await read(turn, self.config.address, ICMAX)
+            icmax = await self._read_icmax(turn)
         except GarbledReplyError:
             return
         except ExchangeRefusedError:
@@ -397,8 +475,19 @@ class AblReader(Charger[AblConfig]):
             self.reports_icmax = False
             self._icmax_due = turn.now + ICMAX_ABSENT
 
+    async def _read_icmax(self, turn: Turn) -> Icmax:
+        """Read 0x000F; what is neither known nor just written is read twice."""
+        known = self._limits
+        icmax = await read(turn, self.config.address, ICMAX)
+        self.reports_icmax = True
+        if known is not None and self.writes.code is not None:
+            written = replace(known, duty=self.writes.code)
+            if icmax == written:
+                return icmax
+        return await self._read_agreed(turn, ICMAX, known, first=icmax)
+
     async def _keep_icmax(self, icmax: Icmax, now: float) -> None:
-        self._icmax = icmax
+        self._icmax = self._limits = icmax
         self._icmax_at = now
         self._icmax_silent = 0
         self.reports_icmax = True
@@ -413,7 +502,7 @@ class AblReader(Charger[AblConfig]):
     async def read_flags(self, turn: Turn) -> None:
         """Read the flags; without a reply the old values count for a while."""
         try:
-            self._flags = await read(turn, self.config.address, FLAGS)
+            self._flags = await self._read_agreed(turn, FLAGS, self._flags)
         except ReplyTimeoutError, ExchangeRefusedError:
             self._flags_missed += 1
             if self._flags_missed >= FLAGS_MISSES:

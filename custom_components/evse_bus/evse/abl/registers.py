@@ -126,8 +126,7 @@ class Icmax:
     """Idefault: the highest Icmax that is followed."""
     duty: int = bits(27, 16, Number(unit="0.1 %"))
     """Icmax, 0.1 %; a pause shows here and nowhere else."""
-    offered: int = bits(11, 0, Number(unit="0.1 %"))
-    """Once seen as 0 on a box that offered 14 A: nothing is decided by it."""
+    # Word 4 is what is offered; once seen as 0 on a box that offered 14 A: not used.
 
 
 ICMAX: Final = Registers(Icmax, "PROTOCOLS.md, 2: 0x000F", Block(0x000F, 5))
