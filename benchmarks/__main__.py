@@ -9,6 +9,7 @@ from typing import Final
 
 from . import (
     abl_scan,
+    adapter_away,
     byte_errors,
     evbox_bus,
     ews_events,
@@ -17,6 +18,7 @@ from . import (
     exchange_cpu,
     home_assistant,
     set_value,
+    slow_lines,
     smartevse_master,
     smartevse_polled,
 )
@@ -38,6 +40,8 @@ BENCHMARKS: Final = {
         ews_events,
         ews_listener,
         byte_errors,
+        adapter_away,
+        slow_lines,
     )
 }
 

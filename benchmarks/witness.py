@@ -11,7 +11,6 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from math import inf
 from typing import Any, Final, Protocol
 
 from custom_components.evse_bus.energy import Clocks, MeterTotal, SummedTotal
@@ -84,6 +83,8 @@ class Box(Protocol):
 
     name: str
     charger: Charger
+    disturbed: bool
+    """It need not be available, nor follow: the port was away."""
     windows: Mapping[str, float]
     """Values that are read less often: their window, s."""
     tolerances: Mapping[str, float]
@@ -111,6 +112,47 @@ class Box(Protocol):
 
     def missed(self) -> int:
         """Return how often the box has missed a keep-alive."""
+
+
+class LimitWatch:
+    """Watches that a current comes down to its limit, in the time allowed."""
+
+    def __init__(
+        self,
+        offered: Callable[[], float],
+        limit: Callable[[], float],
+        allowed: float,
+    ) -> None:
+        """Compare an offer with its limit, A; ``allowed``: time for it, s."""
+        self.times = 0
+        """Times at which it stood above the limit for longer."""
+        self.longest = 0.0
+        """Longest time of it, s."""
+        self._offered = offered
+        self._limit = limit
+        self._allowed = allowed
+        self._loop = asyncio.get_running_loop()
+        self._since: float | None = None
+        self._counted = False
+
+    def look(self, *, disturbed: bool) -> bool:
+        """Look now; return whether the time allowed has just passed.
+
+        While ``disturbed`` nothing is expected.
+        """
+        now = self._loop.time()
+        if disturbed or self._offered() <= self._limit() + TOLERANCE:
+            self._since, self._counted = None, False
+            return False
+        if self._since is None:
+            self._since = now
+        lasted = now - self._since
+        self.longest = max(self.longest, lasted)
+        if lasted <= self._allowed or self._counted:
+            return False
+        self._counted = True
+        self.times += 1
+        return True
 
 
 @dataclass(slots=True)
@@ -155,17 +197,13 @@ class Witness:
         """Prepare; ``allowed_over``: time in which a lower limit must arrive, s."""
         self.box = box
         self.found = Findings()
-        self.disturbed_until = -inf
-        """Until then it need not be available, nor follow: the port was away."""
-        self._allowed_over = allowed_over
+        self._limit = LimitWatch(box.offered, box.ordered, allowed_over)
         self._loop = asyncio.get_running_loop()
         self._history: dict[str, History] = {}
         self._published: dict[str, object] = {}
         self._totals: dict[int, MeterTotal] = {}
         self._sums: dict[int, SummedTotal] = {}
         self._shown_totals: dict[int, float] = {}
-        self._over_since: float | None = None
-        self._over_counted = False
         self._available = True
         self._noticed: frozenset[Fault] = frozenset()
         self._stop: Callable[[], None] = lambda: None
@@ -183,6 +221,10 @@ class Witness:
         if self._looking is not None:
             self._looking.cancel()
         self.found.missed = self.box.missed()
+        self.found.over, self.found.longest_over = (
+            self._limit.times,
+            self._limit.longest,
+        )
         truth = {**self.box.estimates(), **self.box.meters()}
         for number, total in self._shown_totals.items():
             self.found.counted += total
@@ -198,7 +240,11 @@ class Witness:
                 keep = max(self.box.stale, self.box.windows.get(name, 0.0))
                 history = self._history[name] = History(keep)
             history.add(now, value)
-        self._watch_limit(now)
+        if self._limit.look(disturbed=self.box.disturbed):
+            self.found.note(
+                f"{self._at(now)} offers {self.box.offered():g} A,"
+                f" ordered {self.box.ordered():g} A"
+            )
 
     def publish(self) -> None:
         """Compare what is shown from now on."""
@@ -274,28 +320,11 @@ class Witness:
             f" at most {most:.0f}; {self._frames()}"
         )
 
-    def _watch_limit(self, now: float) -> None:
-        over = self.box.offered() > self.box.ordered() + TOLERANCE
-        if not over or now < self.disturbed_until:
-            self._over_since, self._over_counted = None, False
-            return
-        if self._over_since is None:
-            self._over_since = now
-        lasted = now - self._over_since
-        self.found.longest_over = max(self.found.longest_over, lasted)
-        if lasted > self._allowed_over and not self._over_counted:
-            self._over_counted = True
-            self.found.over += 1
-            self.found.note(
-                f"{self._at(now)} offers {self.box.offered():g} A,"
-                f" ordered {self.box.ordered():g} A"
-            )
-
     def _look(self) -> None:
         """Look once a second: availability, and values that have grown stale."""
         now = self._loop.time()
         self._looking = self._loop.call_later(_LOOK, self._look)
-        if now < self.disturbed_until:
+        if self.box.disturbed:
             self._available = True
             return
         self.found.watched += _LOOK

@@ -22,7 +22,7 @@ async def connect[P: asyncio.Protocol](
     if (port := DirectPort.find(url)) is None:
         return await _serialx(loop, factory, url, **settings)
     protocol = factory()
-    return port.open(protocol), protocol
+    return await port.connect(protocol), protocol
 
 
 @contextmanager

@@ -1,15 +1,23 @@
 """A witness finds what is wrong; benchmarks rely on it."""
 
 import asyncio
+from random import Random
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
+from benchmarks import adapter_away
 from benchmarks.byte_errors import Case, case_figures, watch
 from benchmarks.simulated import simulate
-from benchmarks.watched import AblScene, EvboxScene, Scene
+from benchmarks.slow_lines import LateReplies
+from benchmarks.watched import Scene
+from benchmarks.watched_abl import AblScene
+from benchmarks.watched_evbox import EvboxScene
 from benchmarks.witness import History
 from custom_components.evse_bus.evse.errors import NotConfirmedError
 from custom_components.evse_bus.evse.model import OrderChange
+from tests.virtual.adapter import Adapter
 
 
 def test_a_value_that_was_true_in_the_window_is_right() -> None:
@@ -93,3 +101,45 @@ async def _run(scene: Scene, spoil: str) -> list[str]:
 )
 def test_what_is_wrong_is_found(make: type[Scene], spoil: str, expected: str) -> None:
     assert expected in simulate(_run, make(1), spoil)  # type: ignore[call-arg]
+
+
+def test_absences_are_timed() -> None:
+    case = adapter_away.Case("abl", AblScene, times=3, half_open=1)
+    outcome = simulate(adapter_away.absences, case)
+    assert len(outcome.opened) == len(outcome.read) == 3
+    assert all(
+        0 < opened <= read
+        for opened, read in zip(outcome.opened, outcome.read, strict=True)
+    )
+    # Only silence shows it.
+    assert outcome.half_open[0] > 30
+
+
+async def test_a_late_answer_that_is_used_is_found() -> None:
+    received = asyncio.Queue[bytes]()
+    port: Any = SimpleNamespace(opened=1, write=received.put_nowait)
+    on_wire: list[bytes] = []
+    loop: Any = asyncio.get_running_loop()
+    adapter = Adapter(Random(1), on_wire.append, lambda: port, lambda: loop)  # noqa: S311
+    adapter.delay_out = adapter.delay_in = 0.4
+    line = SimpleNamespace(write=adapter.from_client)
+
+    async def exchange() -> bytes:
+        line.write(b"?")
+        return await received.get()
+
+    bus = cast("Any", SimpleNamespace(line=line, wire=SimpleNamespace()))
+    bus.wire.exchange = exchange
+    late = LateReplies(adapter, bus)
+    # Given up before its answer comes, which is then taken for that to the next one.
+    line.write(b"?")
+    await asyncio.sleep(0.5)
+    adapter.to_client(b"one")
+    assert await bus.wire.exchange() == b"one"
+    assert late.used == 1
+    waiting = asyncio.create_task(bus.wire.exchange())
+    await asyncio.sleep(0.5)
+    adapter.to_client(b"two")
+    assert await waiting == b"two"
+    assert late.used == 1
+    assert on_wire == [b"?"] * 3

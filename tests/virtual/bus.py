@@ -6,6 +6,7 @@ import math
 import random
 from typing import TYPE_CHECKING
 
+from .adapter import Adapter
 from .device import REPEAT_GAP
 from .faults import Faults
 from .log import CLIENT, INJECTED, NOISE, Entry, TrafficLog
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from typing import Self
 
     from .device import Device
+    from .ports import Answer
     from .wire import Segment
 
 TICK = 0.05
@@ -35,6 +37,7 @@ class VirtualBus(LoopThread):
     - `url`: the path or URL that a client opens
     - `log`: all traffic
     - `faults`: faults of the whole bus
+    - `adapter`: what lies between the client and the wire
     - `devices`: all devices on it
 
     Every method can be called from any thread.
@@ -81,6 +84,9 @@ class VirtualBus(LoopThread):
         )
         self._make_port = make_port
         self._port: Port | None = None
+        self.adapter = Adapter(
+            self.rng, self.wire.send_client, lambda: self._port, lambda: self.loop
+        )
         self._url = ""
         self._plugged = False
         self._tick_time = tick
@@ -102,7 +108,7 @@ class VirtualBus(LoopThread):
         """Make a bus on a pseudo-terminal; `link` is its stable path."""
 
         def make(bus: VirtualBus) -> Port:
-            return PtyPort(bus.loop, bus.wire.send_client, link)
+            return PtyPort(bus.loop, bus.adapter.from_client, link)
 
         return cls(devices, make, **options)  # type: ignore[arg-type]
 
@@ -113,7 +119,7 @@ class VirtualBus(LoopThread):
         """Make a bus on a TCP socket of this machine."""
 
         def make(bus: VirtualBus) -> Port:
-            return TcpPort(bus.loop, bus.wire.send_client, port)
+            return TcpPort(bus.loop, bus.adapter.from_client, port)
 
         return cls(devices, make, **options)  # type: ignore[arg-type]
 
@@ -122,7 +128,7 @@ class VirtualBus(LoopThread):
         """Make a bus on the running loop, on a `DirectPort`."""
 
         def make(bus: VirtualBus) -> Port:
-            return DirectPort(bus.wire.send_client)
+            return DirectPort(bus.adapter.from_client)
 
         return cls(devices, make, own_thread=False, **options)  # type: ignore[arg-type]
 
@@ -197,6 +203,15 @@ class VirtualBus(LoopThread):
     def replug(self) -> None:
         """Put the adapter back, behind the same path or port number."""
         self.call(self._replug)
+
+    def answer_calls(self, how: Answer) -> None:
+        """Accept, refuse or ignore connections from now on (a network adapter)."""
+
+        def change() -> None:
+            if self._port is not None:
+                self._port.answer(how)
+
+        self.call(change)
 
     # Time
 
@@ -354,6 +369,7 @@ class VirtualBus(LoopThread):
         for timer in self._foreign:
             timer.cancel()
         self.wire.drop_pending()
+        self.adapter.stop()
         if self._port is not None:
             self._port.close()
 
@@ -389,8 +405,7 @@ class VirtualBus(LoopThread):
         self.wire.send(device.name, data, max(self.time(), free_at))
 
     def _to_client(self, data: bytes) -> None:
-        if self._port is not None:
-            self._port.write(data)
+        self.adapter.to_client(data)
 
     def _to_devices(self, segments: list[Segment]) -> None:
         for segment in segments:

@@ -71,7 +71,7 @@ class EwsDialler(VirtualBus):
         def make(_bus: VirtualBus) -> Port:
             dial_port = DialPort(
                 self.loop,
-                self.wire.send_client,
+                self.adapter.from_client,
                 (host, port),
                 source_ports=self._source_ports,
                 on_change=self._link_changed,

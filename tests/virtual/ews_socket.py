@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable
 
+    from .ports import Answer
+
 READ_SIZE = 4096
 CONNECT_TIMEOUT = 5.0
 # Linger on, for 0 s: the connection is reset.
@@ -83,6 +85,16 @@ class DialPort:
 
     def after_reply(self) -> None:
         """Do nothing."""
+
+    def drop_client(self) -> None:
+        """End the connection, and dial again."""
+        self._on_change(False)  # noqa: FBT003 - a callback
+        self.hang_up()
+
+    def answer(self, how: Answer) -> None:
+        """Fail: the box dials, nothing connects to it."""
+        msg = f"a box that dials is none that {how} connections"
+        raise ValueError(msg)
 
     def close(self) -> None:
         """Hang up for good."""

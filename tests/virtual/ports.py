@@ -13,12 +13,20 @@ import shutil
 import socket
 import tempfile
 import termios
-from typing import TYPE_CHECKING, ClassVar, Protocol
+from typing import TYPE_CHECKING, ClassVar, Literal, Protocol
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 READ_SIZE = 4096
+# More connections than wait in the shortest queue of any system.
+QUEUE = 4
+# How an adapter on the network answers a connection that is made to it: "ignores" is a
+# black hole, as one without power or behind a firewall.
+Answer = Literal["accepts", "refuses", "ignores"]
+# A connection without an answer is tried again after these times, s (RFC 6298: 1 s,
+# doubled).
+SYN_REPEATS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 # With a client, and without one: shorter, so that its first bytes are read soon.
 CHORE_INTERVAL = 0.02
 AWAIT_INTERVAL = 0.005
@@ -49,6 +57,12 @@ class Port(Protocol):
 
     def after_reply(self) -> None:
         """Prepare the port for the next open; called after each reply."""
+
+    def drop_client(self) -> None:
+        """End the connection; the next one is possible at once."""
+
+    def answer(self, how: Answer) -> None:
+        """Answer connections in this way from now on."""
 
     def close(self) -> None:
         """Remove the port for good."""
@@ -132,6 +146,14 @@ class PtyPort:
     def after_reply(self) -> None:
         """Keep the next open possible."""
         self._forget_speed()
+
+    def drop_client(self) -> None:
+        """Do nothing: a serial port ends no connection."""
+
+    def answer(self, how: Answer) -> None:
+        """Fail: a serial port is there or not."""
+        msg = f"a pty cannot be one that {how} connections"
+        raise ValueError(msg)
 
     def close(self) -> None:
         """Remove the port and its files."""
@@ -252,6 +274,7 @@ class DirectPort:
         self.opened = 0
         self._url = f"/dev/ttyVirtual{next(self._numbers)}"
         self._plugged = False
+        self._answer: Answer = "accepts"
         self.ports[self._url] = self
 
     @property
@@ -269,8 +292,20 @@ class DirectPort:
         """Return the port of a name or of a link to it, unplugged or not."""
         return cls.ports.get(os.path.realpath(url))
 
+    async def connect(self, protocol: asyncio.Protocol) -> DirectTransport:
+        """Open it as a client; raises OSError as a serial port or a socket would."""
+        for pause in SYN_REPEATS:
+            if self._answer != "ignores":
+                return self.open(protocol)
+            await asyncio.sleep(pause)
+        raise TimeoutError(errno.ETIMEDOUT, os.strerror(errno.ETIMEDOUT))
+
     def open(self, protocol: asyncio.Protocol) -> DirectTransport:
-        """Open it as a client; raises OSError as a serial port would."""
+        """Open it at once."""
+        if self._answer == "refuses":
+            raise ConnectionRefusedError(
+                errno.ECONNREFUSED, os.strerror(errno.ECONNREFUSED)
+            )
         if not self._plugged:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), self._url)
         if self.client is not None:
@@ -298,6 +333,15 @@ class DirectPort:
     def after_reply(self) -> None:
         """Do nothing."""
 
+    def drop_client(self) -> None:
+        """End the connection."""
+        if self.client is not None:
+            self.client.end(None)
+
+    def answer(self, how: Answer) -> None:
+        """Answer connections in this way from now on."""
+        self._answer = how
+
     def close(self) -> None:
         """Remove the port and its name."""
         self.unplug()
@@ -319,6 +363,8 @@ class TcpPort:
         self._port = port
         self._server: socket.socket | None = None
         self._client: socket.socket | None = None
+        self._answer: Answer = "accepts"
+        self._waiting: list[socket.socket] = []
         self.overruns = 0
         self.opened = 0
 
@@ -334,7 +380,7 @@ class TcpPort:
 
     def plug(self) -> None:
         """Listen."""
-        if self._server is not None:
+        if self._server is not None or self._answer == "refuses":
             return
         server = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -347,7 +393,10 @@ class TcpPort:
 
     def unplug(self) -> None:
         """Close the connection and refuse new ones."""
-        self._drop_client()
+        self.drop_client()
+        for waiting in self._waiting:
+            waiting.close()
+        self._waiting.clear()
         if self._server is not None:
             self._loop.remove_reader(self._server.fileno())
             self._server.close()
@@ -362,12 +411,38 @@ class TcpPort:
         except BlockingIOError:
             written = 0
         except OSError:
-            self._drop_client()
+            self.drop_client()
             return
         self.overruns += len(data) - written
 
     def after_reply(self) -> None:
         """Do nothing: a socket needs no preparation."""
+
+    def answer(self, how: Answer) -> None:
+        """Answer new connections in this way; the one that is open stays."""
+        self._answer = how
+        server, self._server = self._server, None
+        if server is not None:
+            self._loop.remove_reader(server.fileno())
+            server.close()
+        for waiting in self._waiting:
+            waiting.close()
+        self._waiting.clear()
+        self.plug()
+        if how == "ignores" and self._server is not None:
+            self._loop.remove_reader(self._server.fileno())
+            self._fill()
+
+    def _fill(self) -> None:
+        """Fill the queue of connections: the system ignores all others then."""
+        if self._server is None:
+            return
+        self._server.listen(0)
+        for _ in range(QUEUE):
+            waiting = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+            waiting.setblocking(False)  # noqa: FBT003 - the call takes no keyword
+            waiting.connect_ex(("127.0.0.1", self._port))
+            self._waiting.append(waiting)
 
     def close(self) -> None:
         """Close the connection and the port."""
@@ -384,7 +459,7 @@ class TcpPort:
             # One client at a time; the second one sees its connection closed.
             client.close()
             return
-        self._drop_client()
+        self.drop_client()
         client.setblocking(False)  # noqa: FBT003 - the call takes no keyword
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._client = client
@@ -414,9 +489,10 @@ class TcpPort:
         if data:
             self._on_bytes(data)
         else:
-            self._drop_client()
+            self.drop_client()
 
-    def _drop_client(self) -> None:
+    def drop_client(self) -> None:
+        """End the connection."""
         if self._client is not None:
             self._loop.remove_reader(self._client.fileno())
             self._client.close()
