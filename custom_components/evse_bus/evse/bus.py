@@ -318,6 +318,9 @@ class Bus(Observable):
             self.wire.statistics.missed_deadlines += 1
         if isinstance(slot, Job):
             await self._jobs.serve(slot, self.wire, connected=lambda: self.connected)
+            if charger is not None and isinstance(slot.outcome, FollowUp):
+                # Of a poll that has rested.
+                self._follow_up(charger, slot.outcome, Persistence.STANDING)
         elif charger is not None:
             await self._poll_turn(charger)
         self._respect_minimum(charger)

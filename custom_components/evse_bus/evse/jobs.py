@@ -58,6 +58,14 @@ class Job(Slot):
         default_factory=lambda: asyncio.get_running_loop().create_future()
     )
 
+    @property
+    def outcome(self) -> object:
+        """Return the result of its conversation; ``None``: it has not ended well."""
+        future = self.future
+        if not future.done() or future.cancelled() or future.exception() is not None:
+            return None
+        return future.result()
+
 
 class JobQueue:
     """All that waits for the bus besides the regular polls."""

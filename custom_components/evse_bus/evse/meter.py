@@ -16,6 +16,8 @@ CONFIRMATIONS: Final = 3
 """Consistent totals in a row that are accepted although they continue nothing."""
 SLACK: Final = 100
 """Largest step of a coarse meter, Wh."""
+SESSION_SLACK: Final = 5.0
+"""Error of the time that a charger counts, s."""
 HIGHEST_PHASE_VOLTAGE: Final = 265.0
 """230 V + 15 %, V: the highest voltage behind a total."""
 HIGHEST_CURRENT: Final = 80.0
@@ -29,10 +31,12 @@ _PHASES: Final = 3
 _SECONDS_PER_HOUR: Final = 3600.0
 
 
-def most_energy(seconds: float, current: float = HIGHEST_CURRENT) -> float:
+def most_energy(
+    seconds: float, current: float = HIGHEST_CURRENT, *, slack: float = SLACK
+) -> float:
     """Return the most a meter can count in a time at a current on 3 phases, Wh."""
     power = current * _PHASES * HIGHEST_PHASE_VOLTAGE
-    return SLACK + power * max(seconds, 0.0) / _SECONDS_PER_HOUR
+    return slack + power * max(seconds, 0.0) / _SECONDS_PER_HOUR
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,3 +140,70 @@ class Meter:
         self.last = total
         self._doubtful.clear()
         self._expected = None
+
+
+# -- The charge under way ------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class SessionReading:
+    """The accepted reading of a charge under way; ``None``: none accepted yet."""
+
+    energy: float | None = None
+    """Wh"""
+    time: int | None = None
+    """s"""
+
+
+@dataclass(frozen=True, slots=True)
+class _Session:
+    energy: Total
+    time: int
+
+    def leads_to(self, later: _Session, current: float) -> bool:
+        """Return whether a later one may be of this charge, or of one begun since."""
+        passed = later.energy.at - self.energy.at + SESSION_SLACK
+        begun = Total(0.0, self.energy.at)
+        return (
+            self.energy.can_grow_to(later.energy, current)
+            and 0 <= later.time - self.time <= passed
+        ) or (begun.can_grow_to(later.energy, current) and later.time <= passed)
+
+
+class SessionMeter:
+    """Energy and time of the charge under way, which each charge begins at 0.
+
+    They count if the charge before goes on, or another has begun since; any others
+    once `CONFIRMATIONS` consistent ones were read.
+    """
+
+    def __init__(self) -> None:
+        """Start without a charge."""
+        self._last: _Session | None = None
+        self._doubtful: list[_Session] = []
+
+    @property
+    def reading(self) -> SessionReading:
+        """Return energy and time that count."""
+        if self._last is None:
+            return SessionReading()
+        return SessionReading(self._last.energy.energy, self._last.time)
+
+    def check(
+        self, energy: Total, seconds: int, current: float = HIGHEST_CURRENT
+    ) -> bool:
+        """Accept what is plausible or confirmed; return whether it is.
+
+        ``current``: the highest phase current behind the meter, A.
+        """
+        session = _Session(energy, seconds)
+        doubtful = self._doubtful
+        if self._last is None or not self._last.leads_to(session, current):
+            if doubtful and not doubtful[-1].leads_to(session, current):
+                doubtful.clear()
+            doubtful.append(session)
+            if len(doubtful) < CONFIRMATIONS:
+                return False
+        self._last = session
+        doubtful.clear()
+        return True

@@ -19,7 +19,7 @@ from custom_components.evse_bus.evse.ews.wire.status import (
     decode_details,
     decode_ports,
 )
-from custom_components.evse_bus.evse.meter import MeterReading
+from custom_components.evse_bus.evse.meter import MeterReading, SessionReading
 from custom_components.evse_bus.evse.model import Capability, SessionResult
 from custom_components.evse_bus.evse.readings import ConnectorReading
 from tests.virtual.ews_rfid import Card as VirtualCard
@@ -48,6 +48,9 @@ def connector(port: int = 1, **changes: object) -> ConnectorReading:
     snapshot = Snapshot(
         ports=tuple(ports),
         meters=tuple(MeterReading(one.total_energy, 3) for one in ports),
+        sessions=tuple(
+            SessionReading(one.session_energy, one.session_time) for one in ports
+        ),
         details=decode_details(DETAILS),
         status=decode_box(BOX),
         installation=Installation(),

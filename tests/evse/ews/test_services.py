@@ -231,7 +231,8 @@ def test_one_bit_is_changed_in_the_field_as_read() -> None:
         assert modes == [SystemMode(before ^ SystemMode.CARDS.value)]
         assert found.mode == modes[0] | SystemMode.EXCLUSIVE
         assert scene.box.system.mode == found.mode.value
-        assert [one.name for one in scene.line.named("rp", "sp")][-3:-1] == ["rp", "sp"]
+        sent = [one.name for one in scene.line.named("rp", "sp")]
+        assert sent[-5:] == ["rp", "rp", "sp", "rp", "rp"]
 
     play(EwsScene(), acts)
 

@@ -4,10 +4,14 @@ Two ports are one box on one line: one ``rc`` and one ``rd`` read both. The box 
 identified when ``id`` and ``rs`` were answered since the line was opened. After a lost
 reply both are asked again: another box may be there now, and a late reply must not be
 taken for the reply to a later command (replies have no number, but keep their order).
+
+Nothing of a reply counts before another one agrees with it (`agreement`), except on a
+line that checks its bytes itself.
 """
 
 import asyncio
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, tzinfo
 from functools import partial
@@ -23,8 +27,24 @@ from ..errors import (
 )
 from ..events import CardPresented, Events
 from ..exchange import Turn
-from ..meter import CONFIRMATIONS, Meter, MeterReading, Total
+from ..meter import (
+    CONFIRMATIONS,
+    Meter,
+    MeterReading,
+    SessionMeter,
+    SessionReading,
+    Total,
+)
 from ..throttle import RateLimiter
+from .agreement import (
+    Agreement,
+    box_continues,
+    details_continue,
+    equal,
+    never,
+    ports_are_like,
+    ports_continue,
+)
 from .timing import (
     BOX_INTERVAL,
     CLOCK_PAUSE,
@@ -41,7 +61,8 @@ from .wire.parameters import EXTRA_BLOCK, SYSTEM_BLOCK, SystemMode, SystemParame
 from .wire.status import Details, Pair, PortStatus, decode_details, decode_ports
 
 MOST_READS: Final = 2 * CONFIRMATIONS
-"""Most readings of ``rc`` in a row until its meters are plausible or confirmed."""
+"""Most readings of a record in a row until two agree, and its meters are plausible or
+confirmed."""
 MOST_KEYS: Final = 100
 """Most key events reported per second: more cannot come from people."""
 _TRIES_PER_OTHER_BCC: Final = 3
@@ -68,6 +89,8 @@ class Snapshot:
     ports: tuple[PortStatus, ...]
     meters: tuple[MeterReading, ...]
     """Of the ports: their accepted totals."""
+    sessions: tuple[SessionReading, ...]
+    """Of the ports: their accepted charges under way."""
     details: Details
     status: BoxStatus
     installation: Installation
@@ -91,6 +114,13 @@ class EwsBox:
         """The checksum it uses; ``None``: not known."""
         self.meters: Pair[Meter] = (Meter(), Meter())
         """Of the ports. They stay while it is away: another box's totals jump."""
+        self.sessions: Pair[SessionMeter] = (SessionMeter(), SessionMeter())
+        """Of the ports: the charges under way."""
+        self.line_checks = False
+        """The line checks its bytes itself (TCP): one reply is enough for a reading."""
+        self._status_replies = Agreement(box_continues, box_continues)
+        self._port_replies = Agreement(equal, ports_continue, ports_are_like)
+        self._detail_replies = Agreement(equal, details_continue)
         self._key_limiter = RateLimiter(MOST_KEYS, 1.0)
         self._opened = -1
         self._tries = 0
@@ -111,12 +141,20 @@ class EwsBox:
         self._restart_flag = False
         self._card_changed = False
         self._clock_after = -inf
+        for agreement in (
+            self._status_replies,
+            self._port_replies,
+            self._detail_replies,
+        ):
+            agreement.forget()
 
-    def on_line_open(self, times: int) -> None:
+    def on_line_open(self, times: int, *, checked: bool) -> None:
         """Drop all readings if the line was opened since the last call.
 
-        ``times``: how often it was opened. Each port calls this.
+        ``times``: how often it was opened. ``checked``: it checks its bytes itself.
+        Each port calls this.
         """
+        self.line_checks = checked
         if times != self._opened:
             self._opened = times
             # The checksum it answered to last is tried first.
@@ -141,6 +179,7 @@ class EwsBox:
         return Snapshot(
             ports=self.ports,
             meters=tuple(meter.reading for meter in self.meters),
+            sessions=tuple(session.reading for session in self.sessions),
             details=self.details,
             status=self.status,
             installation=self.installation,
@@ -156,6 +195,50 @@ class EwsBox:
         Raises ImplausibleReplyError, and what `Turn.exchange` raises.
         """
         return await self.exchange(turn, command, lambda: read(command), decode)
+
+    async def read_confirmed[T](
+        self,
+        turn: Turn,
+        command: CommandId,
+        decode: Callable[[bytes], T],
+        agreement: Agreement[T] | None = None,
+        is_plausible: Callable[[T], bool] = lambda _value: True,
+    ) -> tuple[T, bool]:
+        """Send a reading command, one exchange a turn, until its reply counts.
+
+        ``agreement``: of the replies to this command; ``None``: two must be equal.
+        ``is_plausible`` is called with each reply that others agree with: where it is
+        not, more are read before it counts all the same. Returns the reply, and whether
+        no info record has outdated it. Raises ImplausibleReplyError where none agree,
+        and what `read` raises.
+        """
+        agreement = agreement or Agreement(equal, never)
+        series = agreement.begin()
+        reason = ImplausibleReplyError(f"{command}: replies that do not agree")
+        agreed: tuple[T, bool] | None = None
+        for attempt in range(MOST_READS):
+            if attempt:
+                await rest(0.0)
+            infos = self.info_count
+            try:
+                value = await self.read(turn, command, decode)
+            except ImplausibleReplyError as error:
+                if self.line_checks:
+                    raise
+                reason = error
+                series.interrupt()
+                continue
+            if not (self.line_checks or series.agrees(value, turn.now)):
+                continue
+            agreement.counts(value, turn.now)
+            agreed = value, infos == self.info_count
+            if is_plausible(value):
+                break
+        if agreed is not None:
+            return agreed
+        if series.like is None:
+            raise reason
+        return series.like, False
 
     async def send_command(
         self, turn: Turn, command: CommandId, make: Callable[[], Request]
@@ -212,17 +295,23 @@ class EwsBox:
     # -- Identity ------------------------------------------------------------------
 
     async def wait_for_status(self, turn: Turn) -> BoxStatus:
-        """Ask for ``id`` and ``rs``, with either checksum, until both are answered.
+        """Ask for ``id`` and ``rs``, with either checksum, until two ``rs`` agree.
 
         Raises LineError, and ImplausibleReplyError or ExchangeRefusedError for replies
         that no EWS-Box gives. Does not give up on silence: the caller limits the time.
         """
+        series = self._status_replies.begin()
         while True:
             try:
-                await self._read_firmware_id(turn)
-                return await self.read_status(turn)
+                if not self._answers:
+                    await self._read_firmware_id(turn)
+                status = await self.read(turn, CommandId.READ_BOX, decode_box)
             except ReplyTimeoutError:
+                # Another box may be there.
+                series.interrupt()
                 continue
+            if series.agrees(status, turn.now):
+                return status
 
     async def identify(self, turn: Turn) -> None:
         """Read ``id``, ``rs`` and the installation, one exchange a turn.
@@ -261,7 +350,17 @@ class EwsBox:
 
     async def read_status(self, turn: Turn) -> BoxStatus:
         """Read ``rs``: serial number, flags, clock, the card at the reader."""
-        status = await self.read(turn, CommandId.READ_BOX, decode_box)
+        restarted = False
+
+        def decode(data: bytes) -> BoxStatus:
+            nonlocal restarted
+            status = decode_box(data)
+            restarted |= BoxFlags.RESTARTED in status.flags
+            return status
+
+        status, _ = await self.read_confirmed(
+            turn, CommandId.READ_BOX, decode, self._status_replies
+        )
         before, self.status = self.status, status
         self.status_due = turn.now + BOX_INTERVAL
         if before is not None and before.serial != status.serial:
@@ -269,12 +368,13 @@ class EwsBox:
             self.ports = ()
             self.details = None
             before = None
-        self._check_restart(status)
+        self._check_restart(restarted)
         self._report_card(before, status)
         return status
 
-    def _check_restart(self, status: BoxStatus) -> None:
-        restarted = BoxFlags.RESTARTED in status.flags
+    def _check_restart(self, restarted: bool) -> None:  # noqa: FBT001
+        # In any of the replies: a box may report it once. Believed in vain, it only
+        # makes us read and send more.
         if restarted and not self._restart_flag:
             self.restarts += 1
             self.parameters_due = self._clock_after = -inf
@@ -301,19 +401,23 @@ class EwsBox:
     async def read_parameters(self, turn: Turn) -> None:
         """Read the installation; without a reply, the defaults are assumed."""
         self.parameters_due = turn.now + PARAMETERS_RETRY
-        system: SystemParameters | None = None
         try:
-            system = await self.read(turn, SYSTEM_BLOCK.read, SYSTEM_BLOCK.decode)
-            await rest(0.0)
-            extra = await self.read(turn, EXTRA_BLOCK.read, EXTRA_BLOCK.decode)
+            system, _ = await self.read_confirmed(
+                turn, SYSTEM_BLOCK.read, SYSTEM_BLOCK.decode
+            )
         except ExchangeError:
-            if system is not None:
-                # One block counts, also when the other could not be read.
-                self.installation = self._installation(system, None)
             self.installation = self.installation or Installation()
             return
-        self.parameters_due = turn.now + PARAMETERS_INTERVAL
-        self.installation = self._installation(system, extra.maximum_current_2)
+        await rest(0.0)
+        second: int | None = None
+        # One block counts, also when the other could not be read.
+        with suppress(ExchangeError):
+            extra, _ = await self.read_confirmed(
+                turn, EXTRA_BLOCK.read, EXTRA_BLOCK.decode
+            )
+            second = extra.maximum_current_2
+            self.parameters_due = turn.now + PARAMETERS_INTERVAL
+        self.installation = self._installation(system, second)
 
     def _installation(
         self, system: SystemParameters, second: int | None
@@ -346,37 +450,42 @@ class EwsBox:
     async def read_ports(self, turn: Turn) -> tuple[PortStatus, ...]:
         """Read ``rc``: the status of the ports.
 
-        One with an implausible meter total may be damaged as a whole: nothing of it
-        counts, and it is read again, one exchange a turn, until the total is confirmed.
-        Raises ImplausibleReplyError if it never is, and what `read` raises.
+        Implausible meters are read again, and hold up nothing else. Raises
+        ImplausibleReplyError for replies that do not agree, and what `read` raises.
         """
         known = self.installation or Installation()
         decode = partial(decode_ports, mode_1=known.mode_1, count=known.ports)
-        for _ in range(MOST_READS):
-            infos = self.info_count
-            ports = await self.read(turn, CommandId.READ_PORTS, decode)
-            if self._check_meters(ports, turn.now):
-                self.ports = ports
-                # An info record that came meanwhile has outdated it.
-                self._ports_read_at = turn.now if infos == self.info_count else -inf
-                return ports
-            await rest(0.0)
-        message = "rc: implausible meter totals that do not agree"
-        raise ImplausibleReplyError(message)
+        self.ports, is_current = await self.read_confirmed(
+            turn,
+            CommandId.READ_PORTS,
+            decode,
+            self._port_replies,
+            lambda ports: self._check_meters(ports, turn.now),
+        )
+        # An info record that came meanwhile has outdated it.
+        self._ports_read_at = turn.now if is_current else -inf
+        return self.ports
 
     def _check_meters(self, ports: tuple[PortStatus, ...], now: float) -> bool:
-        """Return whether the totals of all ports are accepted."""
+        """Return whether the totals and the charges of all ports are accepted."""
         # All are checked, also after one that is not accepted.
         accepted = [
             meter.check(Total(port.total_energy, now))
             for meter, port in zip(self.meters, ports, strict=False)
         ]
+        accepted += [
+            session.check(Total(port.session_energy, now), port.session_time)
+            for session, port in zip(self.sessions, ports, strict=False)
+        ]
         return all(accepted)
 
     async def read_details(self, turn: Turn) -> Details:
         """Read ``rd``: limit and power of the ports."""
-        self.details = await self.read(turn, CommandId.READ_DETAILS, decode_details)
-        return self.details
+        details, _ = await self.read_confirmed(
+            turn, CommandId.READ_DETAILS, decode_details, self._detail_replies
+        )
+        self.details = details
+        return details
 
     @property
     def ports_expired(self) -> bool:

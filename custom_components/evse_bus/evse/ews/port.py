@@ -139,7 +139,8 @@ class BoxPort(Charger[EwsPortConfig]):
     @override
     def on_line_open(self) -> None:
         if self.bus is not None:
-            self.box.on_line_open(self.bus.line.statistics.opened)
+            line = self.bus.line
+            self.box.on_line_open(line.statistics.opened, checked=line.opened_by_peer)
         self.last_status = None
 
     # -- Identity --------------------------------------------------------------------

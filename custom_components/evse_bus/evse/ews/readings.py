@@ -125,7 +125,7 @@ def charger_reading(port: int, box: Snapshot, *, paused: bool | None) -> Charger
     """
     at = port - 1
     status, details, installation = box.ports[at], box.details, box.installation
-    meter = box.meters[at]
+    meter, session = box.meters[at], box.sessions[at]
     fixed = installation.fixed_cable
     state = port_state(status, fixed_cable=fixed, paused=paused is True)
     connector = ConnectorReading(
@@ -136,8 +136,8 @@ def charger_reading(port: int, box: Snapshot, *, paused: bool | None) -> Charger
         power=float(details.power[at]),
         energy=meter.energy,
         meter_generation=meter.generation,
-        session_energy=float(status.session_energy),
-        session_time=status.session_time,
+        session_energy=session.energy,
+        session_time=session.time,
         last_session_energy=float(status.last_energy),
         last_session_time=status.last_time,
         last_result=session_result(status.result),

@@ -81,7 +81,7 @@ class Services:
         )
 
     async def _read_cards(self, turn: Turn) -> CardList:
-        return await self._port.box.read(turn, CommandId.READ_CARDS, decode_cards)
+        return await self._read(turn, CommandId.READ_CARDS, decode_cards)
 
     async def card_reader(
         self, target: ReaderTarget, patience: int, data: bytes
@@ -126,16 +126,14 @@ class Services:
     async def read_dhcp(self) -> Dhcp:
         """Return the network settings that the box got by DHCP (``rg``)."""
         return await self._run(
-            lambda turn: self._port.box.read(turn, CommandId.READ_DHCP, decode_dhcp)
+            lambda turn: self._read(turn, CommandId.READ_DHCP, decode_dhcp)
         )
 
     # -- Parameters ------------------------------------------------------------------
 
     async def read_parameters[T](self, block: Block[T]) -> T:
         """Return a block of parameters, with its passwords (``rp ru ri rz``)."""
-        return await self._run(
-            lambda turn: self._port.box.read(turn, block.read, block.decode)
-        )
+        return await self._run(lambda turn: self._read(turn, block.read, block.decode))
 
     async def change_parameters[T](
         self,
@@ -157,7 +155,7 @@ class Services:
 
         async def write(turn: Turn) -> None:
             nonlocal answered
-            raw = await box.read(turn, block.read, bytes)
+            raw = await self._read(turn, block.read, bytes)
             written.update(
                 changes if isinstance(changes, Mapping) else changes(block.decode(raw))
             )
@@ -175,7 +173,7 @@ class Services:
         try:
             return await self._write_and_read(
                 write,
-                lambda turn: box.read(turn, block.read, block.decode),
+                lambda turn: self._read(turn, block.read, block.decode),
                 is_written,
                 lambda: ", ".join(sorted(written)),
             )
@@ -184,6 +182,13 @@ class Services:
             box.parameters_due = -inf
 
     # -- Conversations -----------------------------------------------------------------
+
+    async def _read[T](
+        self, turn: Turn, command: CommandId, decode: Callable[[bytes], T]
+    ) -> T:
+        """Read until two replies are equal; what follows has the turn of the last."""
+        value, _ = await self._port.box.read_confirmed(turn, command, decode)
+        return value
 
     async def send(self, request: Request, *, patience: float = 0.0) -> None:
         """Send a command that is confirmed by one byte; return when it was OK.
