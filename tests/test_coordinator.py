@@ -125,10 +125,8 @@ async def test_issues_go_with_the_charger(hass: HomeAssistant) -> None:
         await hass.config_entries.async_unload(entry.entry_id)
 
 
-@pytest.mark.parametrize("key", ["address", "serial"])
-async def test_a_serial_number_that_another_charger_has_is_not_bound(
-    hass: HomeAssistant, key: str
-) -> None:
+async def test_one_box_at_two_addresses_of_a_bus(hass: HomeAssistant) -> None:
+    """Whichever was added first counts; the other one is not polled."""
     box = AblBox(1, serial="2W22xy00000001")
     with VirtualBus.in_loop(box) as bus:
         entry = await setup_bus(
@@ -138,11 +136,13 @@ async def test_a_serial_number_that_another_charger_has_is_not_bound(
             charger("abl", 1),
             charger("abl", 2, serial=box.serial),
         )
-        await get_entity(hass, "sensor", entry, "1_status")
+        await wait_until(hass, lambda: issue(hass, "set_up_twice_abl2"))
         await hass.async_block_till_done()
-        assert entry.subentries["abl1"].unique_id is None
-        assert entry.subentries["abl1"].data["serial"] is None
-        assert key in entry.subentries["abl1"].data
+        assert entry.subentries["abl1"].data["serial"] == box.serial
+        assert list(entry.runtime_data.chargers) == ["abl1"]
+        hass.config_entries.async_remove_subentry(entry, "abl2")
+        await hass.async_block_till_done()
+        assert issue(hass, "set_up_twice_abl2") is None
         await hass.config_entries.async_unload(entry.entry_id)
 
 

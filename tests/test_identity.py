@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from homeassistant.config_entries import ConfigEntryState
 from homeassistant.core import HomeAssistant
 from homeassistant.helpers import (
     area_registry as ar,
@@ -16,11 +17,14 @@ from custom_components.evse_bus.const import DOMAIN
 from custom_components.evse_bus.energy import TOTALS_KEY
 from custom_components.evse_bus.stores.orders import ORDERS_KEY
 from tests.common import (
+    bus_entry,
     call,
+    charger as stored_charger,
     crash,
     get_entity,
     identity,
     running,
+    setup_bus,
     shut_down,
     state_of,
     wait_for_state,
@@ -278,3 +282,114 @@ async def test_another_box_takes_over_the_names_and_not_the_meter(
         assert (
             hass_storage[TOTALS_KEY]["data"]["evbox_1923054_1_energy"]["total"] == 5000
         )
+
+
+# -- Set up twice ------------------------------------------------------------------------
+
+
+def twin(title: str, subentry_id: str, **more: Any) -> Any:  # noqa: ANN401 - JSON
+    """Return the box with device-ID 1 as it is stored; ``more`` as in `charger`."""
+    box = stored_charger("abl", 1, title=title, **more)
+    return {**box, "subentry_id": subentry_id}
+
+
+@pytest.mark.parametrize("first", ["old", "new"])
+async def test_a_box_in_two_entries_has_one_master(
+    hass: HomeAssistant, first: str
+) -> None:
+    """As after a restored backup; whichever of them is set up first."""
+    one, two = AblBox(1), AblBox(1)
+    with VirtualBus.in_loop(one) as old_bus, VirtualBus.in_loop(two) as new_bus:
+        buses = {
+            "old": (old_bus.url, twin("Old", "01A", serial=one.serial)),
+            "new": (new_bus.url, twin("New", "01B", serial=one.serial)),
+        }
+        order = sorted(buses, key=lambda name: name != first)
+        made = {
+            name: bus_entry("abl", *buses[name], title=f"{name} bus", entry_id=name)
+            for name in order
+        }
+        for entry in made.values():
+            entry.add_to_hass(hass)
+        for entry in made.values():
+            if entry.state is ConfigEntryState.NOT_LOADED:
+                await hass.config_entries.async_setup(entry.entry_id)
+        old, new = made["old"], made["new"]
+        status = await get_entity(hass, "sensor", old, "1_status")
+        limit = await get_entity(hass, "number", old, "charging_current")
+        await call(hass, "number.set_value", limit, value=9)
+        await get_entity(hass, "sensor", old, "1_estimated_energy")
+        await hass.async_block_till_done()
+        kept = furnish(hass, limit)
+        assert new.state is ConfigEntryState.LOADED
+        assert not new.runtime_data.chargers
+        assert new_bus.log.total == 0
+        issue = ir.async_get(hass).async_get_issue(DOMAIN, "set_up_twice_01B")
+        assert issue is not None
+        assert issue.translation_placeholders == {
+            "charger": "New (new bus)",
+            "other": "Old (old bus)",
+        }
+        assert issues(hass) == {"set_up_twice_01B"}
+
+        # The user decides: the other one starts, with all that belongs to the box.
+        hass.config_entries.async_remove_subentry(old, "01A")
+        await wait_until(hass, lambda: new.runtime_data.chargers)
+        await get_entity(hass, "sensor", new, "1_estimated_energy")
+        assert not old.runtime_data.chargers
+        told = old_bus.log.total
+        await all_there(hass, kept)
+        await wait_for_state(hass, kept.limit, "9.0")
+        assert state_of(hass, status) == "available"
+        assert old_bus.log.total == told
+        assert not issues(hass)
+        for entry in made.values():
+            await hass.config_entries.async_unload(entry.entry_id)
+
+
+@pytest.mark.parametrize("removed", ["old", "new"])
+async def test_a_box_that_turns_out_to_be_set_up_elsewhere_is_taken_off(
+    hass: HomeAssistant, removed: str
+) -> None:
+    """Typed in while it was off; its serial number is read later."""
+    one, two = AblBox(1), AblBox(1)
+    other = AblBox(2, serial="2W22xy00000002")
+    with VirtualBus.in_loop(one) as old_bus, VirtualBus.in_loop(other) as new_bus:
+        old = await setup_bus(
+            hass,
+            "abl",
+            old_bus.url,
+            twin("Old", "01A", serial=one.serial),
+            entry_id="old",
+        )
+        beside = stored_charger("abl", 2, serial=other.serial, title="Beside")
+        new = await setup_bus(
+            hass, "abl", new_bus.url, twin("New", "01B"), beside, entry_id="new"
+        )
+        await get_entity(hass, "sensor", old, "1_status")
+        status = await get_entity(hass, "sensor", new, "1_status", index=1)
+        assert not issues(hass)
+        new_bus.add(two)
+        await wait_until(hass, lambda: issues(hass) == {"set_up_twice_01B"})
+        await wait_until(hass, lambda: list(new.runtime_data.chargers) == ["abl2"])
+        writes = len(two.writes)
+        # The rest of its bus runs on, and it is silent, also after a restart.
+        assert state_of(hass, status) == "available"
+        assert await hass.config_entries.async_reload("new")
+        await get_entity(hass, "sensor", new, "1_status", index=1)
+        assert list(new.runtime_data.chargers) == ["abl2"]
+        assert len(two.writes) == writes
+        assert issues(hass) == {"set_up_twice_01B"}
+
+        if removed == "new":
+            hass.config_entries.async_remove_subentry(new, "01B")
+            await hass.async_block_till_done()
+            assert list(old.runtime_data.chargers) == ["01A"]
+        else:
+            await hass.config_entries.async_remove("old")
+            await wait_until(hass, lambda: "01B" in new.runtime_data.chargers)
+            await get_entity(hass, "sensor", new, "1_status")
+        assert not issues(hass)
+        for entry in (old, new):
+            if entry.state is ConfigEntryState.LOADED:
+                await hass.config_entries.async_unload(entry.entry_id)

@@ -11,9 +11,16 @@ from datetime import datetime, timedelta
 from functools import partial
 from typing import Any, Final, override
 
-from homeassistant.config_entries import ConfigEntry, ConfigSubentry
+from homeassistant.config_entries import (
+    SIGNAL_CONFIG_ENTRY_CHANGED,
+    ConfigEntry,
+    ConfigEntryChange,
+    ConfigEntryState,
+    ConfigSubentry,
+)
 from homeassistant.core import CALLBACK_TYPE, Event, HomeAssistant, callback
 from homeassistant.exceptions import ConfigEntryNotReady
+from homeassistant.helpers.dispatcher import async_dispatcher_connect
 from homeassistant.helpers.event import async_track_time_interval
 from homeassistant.helpers.update_coordinator import BaseDataUpdateCoordinatorProtocol
 from homeassistant.util import dt as dt_util
@@ -35,7 +42,7 @@ from .evse.bus import Bus
 from .evse.listeners import notify
 from .evse.model import ChargerConfig, Circuit, Orders
 from .evse.safety import cautious
-from .identity import holder, identity_of, stands_on_serial
+from .identity import Holder, identity_of, older_holder, stands_on_serial
 from .issues import NOT_STORED, BusIssues
 from .managed_charger import ManagedCharger, async_shut_down_chargers
 from .stores.orders import (
@@ -87,6 +94,8 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
             )
         self._not_stored: dict[str, tuple[str, ...]] = {}
         """New chargers whose first orders cannot be stored, with their order keys."""
+        self._duplicates: dict[str, Holder] = {}
+        """Subentries that are not started: their box is set up with an older one."""
         self._listeners: dict[Context, list[CALLBACK_TYPE]] = {}
         self._platforms: list[Callable[[ManagedCharger], None]] = []
         self._unsubscribe: list[CALLBACK_TYPE] = []
@@ -115,6 +124,11 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         """
         await self.orders.async_load()
         self._unsubscribe.append(self.orders.subscribe(self._on_orders_stored))
+        self._unsubscribe.append(
+            async_dispatcher_connect(
+                self.hass, SIGNAL_CONFIG_ENTRY_CHANGED, self._on_entry_changed
+            )
+        )
         await self._async_start_supply()
         await self.async_sync_subentries()
         if self.bus is not None:
@@ -201,10 +215,17 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
             }
             for key in self.chargers.keys() - configured.keys():
                 await self._async_remove_charger(self.chargers[key])
+            self._duplicates = self._find_duplicates()
+            self.issues.set_up_twice(self._duplicates)
+            for key, (subentry, _) in tuple(configured.items()):
+                if subentry.subentry_id in self._duplicates:
+                    del configured[key]
+                    if (other := self.chargers.get(key)) is not None:
+                        await self._async_take_off(other)
             for key, (subentry, config) in configured.items():
                 managed = self.chargers.get(key)
                 if managed and managed.identity != identity_of(subentry):
-                    await self._async_replace_charger(managed)
+                    await self._async_take_off(managed)
                     managed = None
                 if managed is None:
                     await self._async_add_charger(subentry, config)
@@ -212,6 +233,38 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
                     await self._async_change_charger(managed, subentry, config)
             for key in self._not_stored.keys() - configured.keys():
                 await self.orders.async_forget(self._not_stored.pop(key))
+
+    def _find_duplicates(self) -> dict[str, Holder]:
+        """Return the subentries whose box is set up with an older subentry, too."""
+        return {
+            subentry.subentry_id: other
+            for subentry in self.config_entry.get_subentries_of_type(SUBENTRY_CHARGER)
+            if (other := older_holder(self.hass, self.protocol, subentry)) is not None
+        }
+
+    @callback
+    def _on_entry_changed(
+        self, _change: ConfigEntryChange, entry: EvseBusConfigEntry
+    ) -> None:
+        """Follow another entry that has added, removed or identified a box."""
+        if entry.domain == DOMAIN and self._find_duplicates() != self._duplicates:
+            self.config_entry.async_create_task(
+                self.hass,
+                self._async_follow(entry),
+                "evse_bus boxes",
+                eager_start=False,
+            )
+
+    async def _async_follow(self, other: EvseBusConfigEntry) -> None:
+        if other.state is ConfigEntryState.LOADED:
+            # First it takes off what it no longer has: a box has one master.
+            await other.runtime_data.async_settle()
+        await self.async_sync_subentries()
+
+    async def async_settle(self) -> None:
+        """Wait until changes under way are made."""
+        async with self._lock:
+            return
 
     @callback
     def _on_orders_stored(self) -> None:
@@ -307,6 +360,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         await async_shut_down_chargers([managed.charger], removed=True)
         await managed.bus.remove(managed.charger)
         await self.connections.release_bus(managed.bus)
+        await managed.async_remove_entities()
         del self.chargers[managed.key]
         self.devices.remove_port(managed)
         self.issues.forget(managed)
@@ -320,10 +374,10 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
             await self.hass.data[TOTALS].async_forget(managed.identity)
         self._notify(BUS)
 
-    async def _async_replace_charger(self, managed: ManagedCharger) -> None:
-        """Take a charger off the bus whose box was replaced by another.
+    async def _async_take_off(self, managed: ManagedCharger) -> None:
+        """Take a charger off the bus that stays set up.
 
-        Its orders, devices and entities stay, to be handed over.
+        Its orders, devices and registered entities stay.
         """
         managed.unsubscribe()
         await managed.bus.remove(managed.charger)
@@ -429,8 +483,6 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         info = managed.charger.info
         subentry = managed.subentry
         if info is None or info.serial is None or subentry.data.get(CONF_SERIAL):
-            return
-        if holder(self.hass, self.protocol.identity(info.serial), subentry) is not None:
             return
         self.hass.config_entries.async_update_subentry(
             self.config_entry,

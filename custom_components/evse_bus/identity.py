@@ -84,6 +84,23 @@ def _identities(protocol: Protocol, subentry: ConfigSubentry) -> set[str | None]
 
 
 @callback
+def older_holder(
+    hass: HomeAssistant, protocol: Protocol, subentry: ConfigSubentry
+) -> Holder | None:
+    """Return the oldest subentry of this box; ``None``: it is this one.
+
+    Two of them would be two masters. Which one counts does not depend on the order in
+    which entries are set up.
+    """
+    for identity in filter(None, _identities(protocol, subentry)):
+        for one in holders(hass, identity):
+            if one.subentry is subentry:
+                break
+            return one
+    return None
+
+
+@callback
 def holder(
     hass: HomeAssistant, identity: str | None, but: ConfigSubentry | None = None
 ) -> Holder | None:
@@ -94,10 +111,6 @@ def holder(
     if identity is None:
         return None
     return next(
-        (
-            one
-            for one in holders(hass, identity)
-            if but is None or one.subentry.subentry_id != but.subentry_id
-        ),
+        (one for one in holders(hass, identity) if one.subentry is not but),
         None,
     )

@@ -1,6 +1,6 @@
 """Repair issues: problems that only the user can fix; deleted once they are."""
 
-from collections.abc import Set as AbstractSet
+from collections.abc import Mapping, Set as AbstractSet
 from typing import Final
 
 from homeassistant.config_entries import ConfigEntry
@@ -10,6 +10,7 @@ from homeassistant.helpers import issue_registry as ir
 from .const import DOMAIN
 from .evse.model import Fault, Orders
 from .evse.safety import INTERVALS_PER_TIMEOUT
+from .identity import Holder
 from .managed_charger import ManagedCharger
 
 NOT_STORED: Final = "orders_not_stored"
@@ -18,6 +19,7 @@ SUPPLY_LOST: Final = "supply_lost"
 TIMEOUT_RAISED: Final = "timeout_raised"
 ENERGY_NOT_COUNTED: Final = "energy_not_counted"
 SECOND_MASTER: Final = "second_master"
+SET_UP_TWICE: Final = "set_up_twice"
 
 WRONG_CHARGER: Final = "wrong_charger"
 DUPLICATE_ADDRESS: Final = "duplicate_address"
@@ -87,6 +89,28 @@ class BusIssues:
             present=True,
             placeholders={"charger": managed.name, "energy": f"{energy / 1000:+.1f}"},
         )
+
+    def set_up_twice(self, duplicates: Mapping[str, Holder]) -> None:
+        """Report subentries that are not started: their box is set up already.
+
+        ``duplicates``: where, by the id of the subentry.
+        """
+        prefix = f"{SET_UP_TWICE}_"
+        gone = {one for one in self._open if one.startswith(prefix)}
+        for subentry_id, other in duplicates.items():
+            gone.discard(f"{prefix}{subentry_id}")
+            subentry = self._entry.subentries[subentry_id]
+            self._set(
+                SET_UP_TWICE,
+                subentry_id,
+                present=True,
+                placeholders={
+                    "charger": Holder(self._entry, subentry).name,
+                    "other": other.name,
+                },
+            )
+        for issue in gone:
+            self._delete(issue)
 
     def supply_lost(self, current: float) -> None:
         """Report that the stored limit of the shared supply is missing."""
