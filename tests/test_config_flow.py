@@ -147,7 +147,9 @@ async def test_typed_by_hand_keeps_the_serial_that_was_read(
         flow = await port_step(hass, "abl", bus.url)
         await flow.wait()
         assert flow.step == "duplicates"
-        assert flow.result["menu_options"] == ["select", "scan", "manual", "port"]
+        assert flow.result["menu_options"] == [
+            *("sort_out", "select", "scan", "manual", "port"),
+        ]
         await flow.choose("manual")
         await flow.submit({"device_ids": ["4", "1"]})
         assert flow.tells("2W22xy00000004")
@@ -167,7 +169,7 @@ async def test_two_boxes_with_one_id_are_told_and_not_written_to(
         flow = await port_step(hass, "abl", bus.url)
         await flow.wait()
         assert flow.step == "duplicates"
-        assert flow.result["menu_options"] == ["scan", "manual", "port"]
+        assert flow.result["menu_options"] == ["sort_out", "scan", "manual", "port"]
         assert flow.result["description_placeholders"]["addresses"] == "1"
         assert not any(twin.writes for twin in twins)
 

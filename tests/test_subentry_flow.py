@@ -123,7 +123,7 @@ async def test_two_new_boxes_with_one_id(hass: HomeAssistant) -> None:
         await flow.choose("scan")
         await flow.wait()
         assert flow.step == "duplicates"
-        assert flow.result["menu_options"] == ["scan", "manual"]
+        assert flow.result["menu_options"] == ["sort_out", "scan", "manual"]
         assert not any(twin.writes for twin in twins)
         flow.abort()
         await take_down(hass, entry)
@@ -265,6 +265,9 @@ async def test_abl_charger_is_changed_in_place(hass: HomeAssistant) -> None:
         entry = await abl_bus(hass, bus, 1, 2)
         one = get(entry, "Charger 1")
         flow = await Flow.change_charger(hass, entry, one)
+        assert flow.step == "change"
+        assert flow.result["menu_options"] == ["settings", "new_address"]
+        await flow.choose("settings")
         assert flow.step == "reconfigure"
         assert fields(flow) == {
             "name": "Charger 1",
@@ -319,6 +322,8 @@ async def test_abl_charger_is_changed_in_place(hass: HomeAssistant) -> None:
 
         # What was set once can be taken away again.
         flow = await Flow.change_charger(hass, entry, one)
+        await flow.choose("settings")
+        await flow.reload()
         assert fields(flow)["expert"]["order_lifetime"] == 30
         await flow.submit(changed(name="Car port", installation_limit=10))
         await hass.async_block_till_done()

@@ -1,6 +1,7 @@
 """Config flow of a bus: protocol, port, search, chargers; reconfiguration."""
 
-from collections.abc import Mapping
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager
 from functools import partial
 from typing import Any, Final, override
 
@@ -26,6 +27,7 @@ from .const import (
     SUBENTRY_CHARGER,
 )
 from .coordinator import EvseBusConfigEntry
+from .evse.bus import Bus
 from .evse.errors import RefusedOrderError
 from .evse.protocol import Progress, Protocol
 from .evse.protocols import protocols_by_make
@@ -298,12 +300,18 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
     @override
     async def async_scan(self, progress: Progress) -> ScanResult:
         """Open the port for a search, and close it again in any case."""
+        async with self.started_bus() as bus:
+            return await async_search(self.protocol, bus, self._searches, progress)
+
+    @override
+    @asynccontextmanager
+    async def started_bus(self) -> AsyncIterator[Bus]:
         bus = self.protocol.bus(
             self.bus_data[CONF_DEVICE], settings=line_settings(self.bus_data)
         )
         try:
             await bus.start()
-            return await async_search(self.protocol, bus, self._searches, progress)
+            yield bus
         finally:
             await bus.stop()
 

@@ -18,6 +18,7 @@ from homeassistant.config_entries import (
     ConfigEntryState,
     ConfigSubentry,
 )
+from homeassistant.const import CONF_ADDRESS
 from homeassistant.core import CALLBACK_TYPE, Event, HomeAssistant, callback
 from homeassistant.exceptions import ConfigEntryNotReady
 from homeassistant.helpers.dispatcher import async_dispatcher_connect
@@ -325,6 +326,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
             self.issues.forget(managed)
             orders = old.orders if earlier is None else cautious(old.orders, earlier)
             managed.charger = self.protocol.charger(config, orders)
+            managed.address = config.address
             managed.bus = await self.connections.acquire_bus(config, subentry.title)
         self.devices.register_charger(managed)
         if managed.charger is not old:
@@ -446,6 +448,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
     def _on_charger(self, managed: ManagedCharger) -> None:
         """Handle a changed reading, state or configuration of a charger."""
         charger = managed.charger
+        self._store_address(managed)
         reading = charger.reading
         before = managed.connectors
         managed.connectors = (
@@ -477,6 +480,22 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         self._store_serial(managed)
         self.devices.register_charger(managed)
         self._add_entities(managed)
+
+    def _store_address(self, managed: ManagedCharger) -> None:
+        """Store the address that a charger was given over the wire, at once.
+
+        Whoever has asked for it may have gone meanwhile.
+        """
+        address = managed.charger.config.address
+        if address == managed.address:
+            return
+        LOGGER.info("%s has the address %s now", managed.name, address)
+        managed.address = address
+        self.hass.config_entries.async_update_subentry(
+            self.config_entry,
+            managed.subentry,
+            data={**managed.subentry.data, CONF_ADDRESS: address},
+        )
 
     def _store_serial(self, managed: ManagedCharger) -> None:
         """Store the first serial number read: no other box is accepted from then on."""

@@ -43,6 +43,8 @@ class ManagedCharger:
         self.subentry = subentry
         self.charger = charger
         """Replaced when the configuration changes in a way that requires it."""
+        self.address = charger.config.address
+        """Its address as it is stored."""
         self.bus = bus
         self.port_number = port_number
         """Which port of its box this is, from 1; ``None``: a whole box."""

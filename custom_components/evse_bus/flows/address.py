@@ -1,6 +1,6 @@
 """Form fields for the addresses of chargers, and their validation. Pure."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from homeassistant.helpers.selector import (
@@ -23,15 +23,26 @@ type Errors = dict[str, str]
 """Keys of error texts, by the key of the form field."""
 
 
-def address_field(form: AddressForm, *, multiple: bool = False) -> Selector[Any]:
+def numbers(form: AddressForm) -> range:
+    """Return the addresses of a form with few numbers; of another one none."""
+    if form.is_serial or not isinstance(form, NumberAddress):
+        return range(0)
+    return range(form.lowest, form.highest + 1)
+
+
+def address_field(
+    form: AddressForm, *, multiple: bool = False, only: Sequence[int] | None = None
+) -> Selector[Any]:
     """Return the form field for one address or several.
 
-    A serial number is typed; other numbers are few, and chosen from a list.
+    A serial number is typed; other numbers are few, and chosen from a list. ``only``:
+    the numbers to choose from, if they are not all.
     """
+    choices = numbers(form) if only is None else only
     if form.is_serial or not isinstance(form, NumberAddress):
         return TextSelector(TextSelectorConfig(multiple=multiple))
     config = SelectSelectorConfig(
-        options=[str(one) for one in range(form.lowest, form.highest + 1)],
+        options=[str(one) for one in choices],
         multiple=multiple,
         mode=SelectSelectorMode.DROPDOWN,
     )

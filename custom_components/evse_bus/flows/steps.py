@@ -3,11 +3,11 @@
 from abc import abstractmethod
 import asyncio
 from collections.abc import Awaitable, Callable, Iterable, Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, override
 
 from homeassistant.config_entries import ConfigSubentry, ConfigSubentryData
 from homeassistant.const import CONF_ADDRESS, CONF_NAME
-from homeassistant.data_entry_flow import FlowContext, FlowHandler, FlowResult
+from homeassistant.data_entry_flow import FlowContext, FlowResult
 
 from ..configuration import line_settings
 from ..connections import connection_name
@@ -15,6 +15,7 @@ from ..const import CONF_INSTALLATION_LIMIT, SUBENTRY_CHARGER
 from ..evse.scan import Address, ScanResult
 from ..identity import Holder, holder, identity_data
 from .address import Errors, manual_form, typed_addresses
+from .address_change import AddressSteps
 from .charger import (
     NO,
     Candidate,
@@ -24,6 +25,7 @@ from .charger import (
     confirm_row,
     default_name,
 )
+from .progress import async_show_long_enough
 from .schema import (
     CONF_CHARGERS,
     SUGGESTED_LIMIT,
@@ -36,16 +38,9 @@ from .search import error_key
 from .supply import supply_texts
 
 if TYPE_CHECKING:
-    from ..evse.protocol import Progress, Protocol
+    from ..evse.protocol import Progress
     from ..evse.scan import FoundCharger
 
-
-SHOWN_FOR: Final = 1.5
-"""Shortest time a search is shown, s.
-
-The frontend subscribes to the event of the end only once it shows the progress; an
-event before that is lost, and the dialogue stays as it is for ever.
-"""
 
 type Step[ResultT] = Callable[[dict[str, Any] | None], Awaitable[ResultT]]
 """A step of a flow: takes the filled-in form, if any."""
@@ -55,7 +50,7 @@ class ChargerSteps[
     ContextT: FlowContext,
     ResultT: FlowResult[Any, Any],
     HandlerT,
-](FlowHandler[ContextT, ResultT, HandlerT]):
+](AddressSteps[ContextT, ResultT, HandlerT]):
     """Steps from a bus to the data of its new chargers."""
 
     adds_several: ClassVar[bool]
@@ -66,7 +61,6 @@ class ChargerSteps[
     def __init__(self) -> None:
         """Start without chargers."""
         super().__init__()
-        self.protocol: Protocol
         self.bus_data: dict[str, Any]
         """Data of the config entry of the bus."""
         self.ready: list[ConfigSubentryData] = []
@@ -128,7 +122,8 @@ class ChargerSteps[
         if self._scan_task is None:
             # The flow manager cancels it when the flow is closed.
             self._scan_task = self.hass.async_create_background_task(
-                self._async_scan_visibly(), "evse_bus search"
+                async_show_long_enough(self.async_scan(self.async_update_progress)),
+                "evse_bus search",
             )
         if not self._scan_task.done():
             return self.async_show_progress(
@@ -143,17 +138,6 @@ class ChargerSteps[
             return self.async_show_progress_done(next_step_id=self.step_after_error)
         self._result = task.result()
         return self.async_show_progress_done(next_step_id=self._step_after_scan())
-
-    async def _async_scan_visibly(self) -> ScanResult:
-        """Search for `SHOWN_FOR` at least, also where the search fails."""
-        result, _ = await asyncio.gather(
-            self.async_scan(self.async_update_progress),
-            asyncio.sleep(SHOWN_FOR),
-            return_exceptions=True,
-        )
-        if isinstance(result, BaseException):
-            raise result
-        return result
 
     def _step_after_scan(self) -> str:
         if self._result.other_master:
@@ -217,7 +201,18 @@ class ChargerSteps[
         label = self.protocol.address.label
         addresses = ", ".join(label(one) for one in self._result.duplicates)
         first = ("select",) if self._new() else ()
+        if self.protocol.change_address is not None:
+            first = ("sort_out", *first)
         return self._menu("duplicates", first, addresses=addresses)
+
+    @override
+    def shared_addresses(self) -> tuple[int, ...]:
+        return self._result.duplicates
+
+    @override
+    def used_addresses(self) -> set[Address]:
+        found = {one.address for one in self._result.found}
+        return self.taken() | found | set(self._result.duplicates)
 
     async def async_step_unsupported(
         self,

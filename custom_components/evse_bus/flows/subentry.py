@@ -1,6 +1,7 @@
 """Flow of a subentry: add a charger to a bus, or reconfigure it."""
 
-from collections.abc import Mapping
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any, override
 
 from homeassistant.config_entries import (
@@ -39,6 +40,7 @@ from .steps import ChargerSteps
 
 if TYPE_CHECKING:
     from ..coordinator import EvseBusConfigEntry
+    from ..evse.bus import Bus
     from ..evse.protocol import Progress
 
 
@@ -50,6 +52,12 @@ class ChargerSubentryFlow(
 
     adds_several = False
     step_after_error = "manual"
+
+    def __init__(self) -> None:
+        """Start with the choice of what to change."""
+        super().__init__()
+        self._settings = False
+        """The configuration is being changed, not the charger itself."""
 
     @override
     def others(self) -> list[ConfigSubentry]:
@@ -109,12 +117,20 @@ class ChargerSubentryFlow(
     @override
     async def async_scan(self, progress: Progress) -> ScanResult:
         """Search between the turns of the running chargers."""
-        connections = self._connections()
-        if connections is None or connections.shared_bus is None:
+        async with self.started_bus() as bus:
+            probe = read_only_probe(self.protocol)
+            return await async_search(self.protocol, bus, [probe], progress)
+
+    @override
+    @asynccontextmanager
+    async def started_bus(self) -> AsyncIterator[Bus]:
+        if (bus := self._running_bus()) is None:
             raise NotAvailableError(self._get_entry().title)
-        probe = read_only_probe(self.protocol)
-        bus = connections.shared_bus
-        return await async_search(self.protocol, bus, [probe], progress)
+        yield bus
+
+    def _running_bus(self) -> Bus | None:
+        connections = self._connections()
+        return None if connections is None else connections.shared_bus
 
     @override
     def finish(self, chargers: list[ConfigSubentryData]) -> SubentryFlowResult:
@@ -142,6 +158,12 @@ class ChargerSubentryFlow(
         entry = self._get_entry()
         subentry = self._get_reconfigure_subentry()
         self.protocol = protocol_of(entry.data)
+        if user_input is None and not self._settings and self._can_change_address():
+            return self.async_show_menu(
+                step_id="change",
+                menu_options=["settings", "new_address"],
+                description_placeholders={"name": subentry.title},
+            )
         errors: Errors = {}
         if user_input is not None:
             form = self.protocol.address
@@ -187,6 +209,64 @@ class ChargerSubentryFlow(
         if before is None or serial == before:
             return kept_identity(subentry)
         return another_identity(self.protocol, serial)
+
+    async def async_step_settings(
+        self,
+        user_input: dict[str, Any] | None = None,  # noqa: ARG002 - a step's signature
+    ) -> SubentryFlowResult:
+        """Change the configuration, not the charger itself."""
+        self._settings = True
+        return await self.async_step_reconfigure()
+
+    # -- Another address, over the wire ------------------------------------------
+
+    def _can_change_address(self) -> bool:
+        return (
+            self.protocol.change_address is not None and self._running_bus() is not None
+        )
+
+    async def async_step_change(
+        self, user_input: dict[str, Any] | None = None
+    ) -> SubentryFlowResult:
+        """Choose what to change; a page that is loaded again asks for this step."""
+        return await self.async_step_reconfigure(user_input)
+
+    async def async_step_new_address(
+        self, user_input: dict[str, Any] | None = None
+    ) -> SubentryFlowResult:
+        """Ask for the new address of the charger."""
+        subentry = self._get_reconfigure_subentry()
+        self.moving = subentry.data.get(CONF_SERIAL) or self.moving
+        old = int(subentry.data[CONF_ADDRESS])
+        return await self.async_ask_address(
+            ("new_address", "address_changed"),
+            [old],
+            user_input,
+            name=subentry.title,
+        )
+
+    async def async_step_address_changed(
+        self,
+        user_input: dict[str, Any] | None = None,  # noqa: ARG002
+    ) -> SubentryFlowResult:
+        """Report the new address, which is stored since the charger has moved."""
+        reason = "address_changed"
+        if self.changed is not None and self.changed.enabled:
+            reason = "address_changed_enabled"
+        elif self.changed is not None and self.changed.old_in_use:
+            reason = "address_changed_old_in_use"
+        name = self._get_reconfigure_subentry().title
+        return self.async_abort(
+            reason=reason,
+            description_placeholders=self.change_texts() | {"name": name},
+        )
+
+    @override
+    def used_addresses(self) -> set[Address]:
+        own = self.context.get("subentry_id")
+        subentry = self._get_entry().subentries.get(own or "")
+        used = super().used_addresses()
+        return used if subentry is None else used | {subentry.data[CONF_ADDRESS]}
 
     def _serial(self, address: Address, typed: dict[str, Any]) -> str | None:
         form = self.protocol.address
