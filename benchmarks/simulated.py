@@ -44,7 +44,7 @@ def simulate[**P, T](
     errors = ErrorCounter()
     library = logging.getLogger("custom_components.evse_bus")
     library.addHandler(errors)
-    library.propagate = False
+    propagated, library.propagate = library.propagate, False
     loop = SimulatedLoop()
     loop.ends_at = inf
     try:
@@ -52,6 +52,7 @@ def simulate[**P, T](
             result = runner.run(scene(*args, **kwargs))
     finally:
         library.removeHandler(errors)
+        library.propagate = propagated
     if errors.texts:
         message = f"{len(errors.texts)} errors were logged: {errors.texts[0]}"
         raise RuntimeError(message)
