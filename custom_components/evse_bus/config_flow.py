@@ -17,6 +17,7 @@ from homeassistant.core import callback
 from homeassistant.data_entry_flow import AbortFlow
 
 from .configuration import line_settings, protocol_of
+from .connections import line_memory
 from .const import (
     CONF_FAIL_SAFE_CURRENT,
     CONF_FAIL_SAFE_TIMEOUT,
@@ -307,7 +308,9 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
     @asynccontextmanager
     async def started_bus(self) -> AsyncIterator[Bus]:
         bus = self.protocol.bus(
-            self.bus_data[CONF_DEVICE], settings=line_settings(self.bus_data)
+            self.bus_data[CONF_DEVICE],
+            settings=line_settings(self.bus_data),
+            memory=line_memory(self.hass, self.bus_data[CONF_DEVICE]),
         )
         try:
             await bus.start()

@@ -13,16 +13,20 @@ from typing import Any, Final, override
 from homeassistant.config_entries import ConfigEntry, ConfigEntryState
 from homeassistant.const import CONF_DEVICE, CONF_HOST, CONF_PORT
 from homeassistant.core import HomeAssistant, callback
+from homeassistant.util.hass_dict import HassKey
 
 from .configuration import line_settings, protocol_of, supply_of
-from .const import CONF_ALLOWED
+from .const import CONF_ALLOWED, DOMAIN
 from .evse.bus import Bus
 from .evse.dialling import Network, UnknownBox
 from .evse.errors import LineError
-from .evse.line import Line
+from .evse.line import Line, canonical_url
 from .evse.master import BusMaster
+from .evse.memory import LineMemory
 from .evse.model import ChargerConfig
 from .evse.recovery import PAUSES
+
+_LINES: Final[HassKey[dict[str, LineMemory]]] = HassKey(f"{DOMAIN}.lines")
 
 SETUP_PAUSE: Final = PAUSES[-1]
 """Pause before each attempt to open the port of a config entry that waits for it, s."""
@@ -79,7 +83,7 @@ class Connections(ABC):
 class PortConnection(Connections):
     """One port, and one bus on it."""
 
-    def __init__(self, entry: ConfigEntry) -> None:
+    def __init__(self, hass: HomeAssistant, entry: ConfigEntry) -> None:
         """Create the bus; the port is not opened."""
         self.name = connection_name(entry.data)
         self._bus = protocol_of(entry.data).bus(
@@ -87,6 +91,7 @@ class PortConnection(Connections):
             settings=line_settings(entry.data),
             name=entry.title,
             circuit=supply_of(entry.data),
+            memory=line_memory(hass, self.name),
         )
 
     @property
@@ -191,13 +196,24 @@ class ListenerConnections(Connections):
         self.listener.allow(allowed_networks(options))
 
 
+def line_memory(hass: HomeAssistant, device: str) -> LineMemory:
+    """Return what is known of the line at a port, until Home Assistant stops.
+
+    From searches and from all buses that were on it.
+    """
+    lines = hass.data.setdefault(_LINES, {})
+    return lines.setdefault(canonical_url(device), LineMemory())
+
+
 def make_connections(
-    entry: ConfigEntry, on_unknown_box: Callable[[UnknownBox], None]
+    hass: HomeAssistant,
+    entry: ConfigEntry,
+    on_unknown_box: Callable[[UnknownBox], None],
 ) -> Connections:
     """Return the connections of a config entry; nothing is opened."""
     if protocol_of(entry.data).dials_in:
         return ListenerConnections(entry, on_unknown_box)
-    return PortConnection(entry)
+    return PortConnection(hass, entry)
 
 
 def allowed_networks(options: Mapping[str, Any]) -> list[Network]:

@@ -78,7 +78,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         """Entry data the bus was made from; a change requires a new bus."""
         self.protocol = protocol_of(entry.data)
         self.connections = make_connections(
-            entry, partial(async_wants_to_connect, hass, entry)
+            hass, entry, partial(async_wants_to_connect, hass, entry)
         )
         self.chargers: dict[str, ManagedCharger] = {}
         self.issues = BusIssues(hass, entry)

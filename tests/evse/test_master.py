@@ -44,8 +44,8 @@ class Beat(BusMaster):
 
     @property
     @override
-    def refusal(self) -> str | None:
-        return "hush" if self.silent else None
+    def refusal(self) -> NotAvailableError | None:
+        return NotAvailableError("hush") if self.silent else None
 
     @override
     def on_line_open(self, now: float) -> None:

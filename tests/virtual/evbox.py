@@ -98,6 +98,7 @@ class EvboxChargePoint(Device):
     - `counters`: refused and malformed requests
     - `serial` can be set: another ChargePoint in its place
     - `min_interval` (s): reported in the reply, and enforced in real time
+    - `too_soon_restarts`: a request within it begins it anew (no source settles that)
     """
 
     protocol: ClassVar[str] = "evbox"
@@ -110,6 +111,7 @@ class EvboxChargePoint(Device):
         *,
         max_current: float = 35.0,
         min_interval: int = 1,
+        too_soon_restarts: bool = False,
         commands: frozenset[int] | set[int] = frozenset({68, 69}),
         turn_round: float = 0.0,
         jitter: float = 0.0002,
@@ -123,6 +125,7 @@ class EvboxChargePoint(Device):
         self.modules = modules
         self.max_current = max_current
         self.min_interval = min_interval
+        self.too_soon_restarts = too_soon_restarts
         self.commands = set(commands)
         self.turn_round = turn_round
         self.jitter = jitter
@@ -258,6 +261,8 @@ class EvboxChargePoint(Device):
         last = self._standing.received_at if self._standing else float("-inf")
         if received.end - last < self.min_interval - INTERVAL_TOLERANCE:
             self.counters.too_soon += 1
+            if self._standing and self.too_soon_restarts:
+                self._standing.received_at = received.end
             return
         self._accept(request)
 

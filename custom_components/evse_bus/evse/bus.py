@@ -84,6 +84,7 @@ class Bus(Observable):
         self._failures = RateLimiter(FAILURES_LOGGED, FAILURES_WINDOW)
         if group is not None:
             group.bus = self
+            group.resume(line.memory)
 
     @property
     def name(self) -> str:
@@ -150,6 +151,9 @@ class Bus(Observable):
         if self.group is not None:
             self.group.added(charger)
         charger.slot.worst_case = self.worst_case(charger)
+        charger.resume(self.line.memory)
+        if self.connected:
+            self._respect_minimum(charger)
         self.reschedule()
 
     async def remove(self, charger: Charger) -> None:

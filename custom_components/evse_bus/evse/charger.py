@@ -30,6 +30,7 @@ from .framing import Frame, Timing
 from .jobs import Job, merge_key
 from .line import Line
 from .listeners import Observable
+from .memory import LineMemory
 from .model import (
     Capability,
     ChargerConfig,
@@ -289,6 +290,12 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
 
         ``removed``: only this charger is taken off for good; the bus goes on. Raises
         what `run` raises.
+        """
+
+    def resume(self, memory: LineMemory) -> None:
+        """Go on with what an earlier bus or a search has learnt on this line.
+
+        Called when it is put on a bus, before it is polled.
         """
 
     @abstractmethod

@@ -112,7 +112,7 @@ class Wire:
         bad, noise = self._framer.bad, self._framer.noise
         started = loop.time()
         sent = self.line.write(data, reply_may_equal=reply_may_equal)
-        self.sent_at = sent
+        self.sent_at = self.line.memory.sent_at = sent
         pending = _PendingReply(
             accept,
             first_byte_by=sent + self.round_trip.timeout + patience,
@@ -170,7 +170,7 @@ class Wire:
         data = request() if callable(request) else request
         self._drop_incomplete_frame()
         sent = self.line.write(data)
-        self.sent_at = sent
+        self.sent_at = self.line.memory.sent_at = sent
         self.frames.add(Direction.OUT, self._framer.redacted(data))
         self.statistics.sent_only += 1
         # The line is in use until the last byte has been sent.

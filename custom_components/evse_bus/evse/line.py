@@ -7,10 +7,13 @@ its own transmission (common on two-wire RS-485).
 
 import asyncio
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 import errno
+from ipaddress import ip_address
 import socket
-from typing import ClassVar, override
+from typing import ClassVar, Final, override
+from urllib.parse import urlsplit
 
 from serialx import (
     BaseSerialTransport,
@@ -29,11 +32,15 @@ from .errors import (
     PortSettingsError,
 )
 from .framing import LineSettings
+from .memory import LineMemory
 
 OPEN_TIMEOUT = 4.0
 """Longest wait for a port to open (a network port may not answer), s."""
 CLOSE_TIMEOUT = 1.0
 """Longest wait for a port to close, s; then it is closed without its last bytes."""
+
+_NETWORK: Final = frozenset({"socket", "rfc2217"})
+"""Schemes that can name one TCP port of an adapter."""
 
 _PARITIES = {"N": Parity.NONE, "E": Parity.EVEN, "O": Parity.ODD}
 _STOP_BITS = {1: StopBits.ONE, 2: StopBits.TWO}
@@ -67,6 +74,24 @@ def line_error(error: Exception) -> LineError:
     return LineError(str(error) or type(error).__name__)
 
 
+def canonical_url(url: str) -> str:
+    """Return the one spelling of a URL; anything else as it is."""
+    if "://" not in url:
+        return url
+    try:
+        parts = urlsplit(url.strip())
+        host, port = parts.hostname or "", parts.port
+    except ValueError:
+        return url
+    name = host.removesuffix(".").removesuffix(".local")
+    with suppress(ValueError):
+        name = str(ip_address(host))
+    if parts.scheme in _NETWORK:
+        return f"//{name}:{port}"
+    # Several ports of one device may differ only in what follows the address.
+    return f"{parts.scheme}://{name}:{port}{parts.path.rstrip('/')}?{parts.query}"
+
+
 @dataclass(slots=True)
 class LineStatistics:
     """Traffic of a line since it was created; survives reopening."""
@@ -88,6 +113,8 @@ class Line:
         """Set URL and line settings; nothing is opened yet."""
         self.url = url
         self.settings = settings
+        self.memory = LineMemory()
+        """What is known of it; replaced by that of an earlier bus, if there was one."""
         self.statistics = LineStatistics()
         self.on_data: Callable[[bytes], None] = lambda _data: None
         """Called with received bytes, without the echo."""

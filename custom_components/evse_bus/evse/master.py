@@ -13,6 +13,7 @@ from .errors import NotAvailableError
 from .exchange import Turn
 from .framing import Frame
 from .listeners import Observable
+from .memory import LineMemory
 from .model import Circuit, Fault
 from .schedule import Kind, Slot
 from .statistics import ChargerStatistics
@@ -23,6 +24,9 @@ class ChargerGroup:
 
     bus: Scheduler | None = None
     """The bus; set by it."""
+
+    def resume(self, memory: LineMemory) -> None:
+        """Go on with what an earlier bus or a search has learnt on this line."""
 
     def added(self, charger: Charger) -> None:
         """Take in a charger that was put on the bus."""

@@ -17,6 +17,7 @@ from .dialling import Listener, ListenerFactory, Network, UnknownBoxCallback
 from .framing import Frame, Framer, LineSettings, Timing
 from .line import Line
 from .master import BusMaster, ChargerGroup
+from .memory import LineMemory
 from .model import ChargerConfig, Circuit, Orders
 from .options import Option
 from .redaction import SerialNumbers
@@ -148,16 +149,20 @@ class Protocol[C: ChargerConfig = Any]:
         settings: LineSettings | None = None,
         name: str = "",
         circuit: Circuit | None = None,
+        memory: LineMemory | None = None,
     ) -> Bus:
         """Return a bus of this protocol on a port; `Bus.start` opens it.
 
-        ``circuit`` is shared by its chargers, where the bus has a master. Raises
-        TypeError where boxes dial us: then the listener makes the buses.
+        ``circuit`` is shared by its chargers, where the bus has a master. ``memory``:
+        what is known of this line; ``None``: nothing. Raises TypeError where boxes
+        dial us: then the listener makes the buses.
         """
         if self.dials_in:
             message = f"{self.name}: there is no port to open, a listener has its buses"
             raise TypeError(message)
         line = Line(url, settings or self.settings)
+        if memory is not None:
+            line.memory = memory
         group: ChargerGroup | None = None
         if self.master is not None:
             group = self.master(circuit or Circuit())

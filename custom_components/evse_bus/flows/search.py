@@ -1,9 +1,7 @@
 """Trying a port and searching a bus, for the flows."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from functools import partial
-from ipaddress import ip_address
 from os.path import realpath
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import urlsplit
@@ -25,7 +23,7 @@ from ..evse.errors import (
     PortPermissionError,
     PortSettingsError,
 )
-from ..evse.line import Line
+from ..evse.line import Line, canonical_url
 from ..evse.model import ChargerConfig, CurrentLimit, Orders
 from ..evse.scan import ScanResult
 from .schema import CONF_SEARCH_CURRENT
@@ -38,9 +36,6 @@ if TYPE_CHECKING:
 
 type Probe = tuple[ChargerConfig, Orders]
 """Configuration and orders that a search uses; sent where every message sets limits."""
-
-_NETWORK: Final = frozenset({"socket", "rfc2217"})
-"""Schemes that can name one TCP port of an adapter."""
 
 _ERRORS: Final[dict[type[Exception], str]] = {
     PortBusyError: "port_busy",
@@ -86,25 +81,7 @@ def is_same_port(one: str, other: str) -> bool:
 
 def is_same_url(one: str, other: str) -> bool:
     """Return whether two URLs are those of one port, in whatever spelling."""
-    return _canonical(one) == _canonical(other)
-
-
-def _canonical(url: str) -> tuple[str, ...]:
-    """Return the one spelling of a URL; anything else as it is."""
-    if "://" not in url:
-        return (url,)
-    try:
-        parts = urlsplit(url.strip())
-        host, port = parts.hostname or "", parts.port
-    except ValueError:
-        return (url,)
-    scheme = "" if parts.scheme in _NETWORK else parts.scheme
-    name = host.removesuffix(".").removesuffix(".local")
-    with suppress(ValueError):
-        name = str(ip_address(host))
-    # Several ports of one device may differ only in what follows the address.
-    more = "" if parts.scheme in _NETWORK else f"{parts.path.rstrip('/')}?{parts.query}"
-    return (scheme, name, str(port), more)
+    return canonical_url(one) == canonical_url(other)
 
 
 def port_name(url: str) -> str:

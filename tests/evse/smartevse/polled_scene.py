@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import override
 
 from custom_components.evse_bus.evse.bus import Bus
+from custom_components.evse_bus.evse.memory import LineMemory
 from custom_components.evse_bus.evse.model import CurrentLimit, Orders
 from custom_components.evse_bus.evse.readings import ChargerReading, ConnectorReading
 from custom_components.evse_bus.evse.smartevse import POLLED
@@ -71,6 +72,17 @@ class PolledScene(LiveScene):
         self.bus = Bus(self.line, POLLED.framer(), POLLED.timing, "simulated")
         self.charger = self.make_charger()
         self.bus.add(self.charger)
+
+    async def restart(self, away: float = 0.0, *, reload: bool = False) -> None:
+        """Restart the library; ``reload``: in the same process, which remembers."""
+        await self.bus.stop()
+        if not reload:
+            self.line.memory = LineMemory()
+        await asyncio.sleep(away)
+        self.bus = Bus(self.line, POLLED.framer(), POLLED.timing, "again")
+        self.charger = self.make_charger()
+        self.bus.add(self.charger)
+        await self.bus.start()
 
     def make_box(self, dialect: Dialect) -> Box:
         controller = SmartEvseController(

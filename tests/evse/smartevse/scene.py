@@ -11,6 +11,7 @@ from typing import override
 
 from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.framing import LineSettings
+from custom_components.evse_bus.evse.memory import LineMemory
 from custom_components.evse_bus.evse.modbus import RtuFramer
 from custom_components.evse_bus.evse.model import Circuit, CurrentLimit, Orders
 from custom_components.evse_bus.evse.smartevse import MASTER
@@ -171,8 +172,13 @@ class MasterScene(LiveScene):
             self.plug_box(unit)
             self.add(unit)
 
-    def new_bus(self) -> None:
-        """Restart the library; the boxes go on."""
+    def new_bus(self, *, reload: bool = False) -> None:
+        """Restart the library; the boxes go on.
+
+        ``reload``: in the same process, which remembers the line.
+        """
+        if not reload:
+            self.line.memory = LineMemory()
         self.master = Master(Circuit(limit=self.limit, minimum=self.minimum))
         self.bus = Bus(
             self.line, RtuFramer(), MASTER.timing, "simulated", group=self.master

@@ -27,7 +27,7 @@ acts = st.lists(
                 "come",
                 "come",
                 *("leave", "rest", "ask", "deaf", "mute", "lossy", "reset", "press"),
-                *("unplug", "again", "remove", "well", "well"),
+                *("unplug", "again", "reload", "remove", "well", "well"),
                 *("off", "on", "none", "less", "more"),
             )
         ),
@@ -73,10 +73,10 @@ async def act_on_bus(scene: MasterScene, what: str, unit: int) -> None:
     slave = scene.bus.chargers.get(str(unit))
     if what == "unplug":
         scene.line.unplug()
-    elif what == "again":
-        # Home Assistant is restarted without a shutdown.
+    elif what in ("again", "reload"):
+        # Home Assistant is restarted without a shutdown, or only the config entry.
         await scene.bus.stop()
-        scene.new_bus()
+        scene.new_bus(reload=what == "reload")
         for one in UNITS:
             scene.add(one)
         await scene.bus.start()

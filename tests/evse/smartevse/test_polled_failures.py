@@ -7,7 +7,6 @@ from itertools import pairwise
 
 import pytest
 
-from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.errors import EvseError, NotConfirmedError
 from custom_components.evse_bus.evse.model import (
     Fault,
@@ -162,8 +161,12 @@ def test_a_firmware_without_the_override_is_stopped() -> None:
     play(PolledScene(V2_17, override_works=False), acts)
 
 
+@pytest.mark.parametrize("reload", [True, False])
 @pytest.mark.parametrize("after", [0.2, 2.0, 3.9, 6.0])
-def test_a_reload_does_not_stop_a_later_box(after: float) -> None:
+def test_a_reload_does_not_stop_a_later_box(
+    after: float,
+    reload: bool,  # noqa: FBT001
+) -> None:
     async def run() -> None:
         scene = PolledScene(LATER)
         errors: list[int] = []
@@ -175,11 +178,7 @@ def test_a_reload_does_not_stop_a_later_box(after: float) -> None:
             last = len(scene.line.sent)
             await scene.until(lambda: len(scene.line.sent) > last)
             await asyncio.sleep(after)
-            await scene.bus.stop()
-            scene.bus = Bus(scene.line, POLLED.framer(), POLLED.timing, "again")
-            scene.charger = scene.make_charger()
-            scene.bus.add(scene.charger)
-            await scene.bus.start()
+            await scene.restart(reload=reload)
             await asyncio.sleep(30)
             assert not any(errors)
 

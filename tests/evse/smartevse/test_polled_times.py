@@ -6,9 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.model import OrderChange
-from custom_components.evse_bus.evse.smartevse import POLLED
 from custom_components.evse_bus.evse.smartevse.dialects import Dialect
 from tests.simulated_time import now, simulate
 
@@ -52,12 +50,14 @@ async def reconnected(scene: PolledScene) -> None:
 async def restarted(scene: PolledScene) -> None:
     """Restart the library, as with Home Assistant."""
     await charging(scene)
-    await scene.bus.stop()
-    await asyncio.sleep(10)
-    scene.bus = Bus(scene.line, POLLED.framer(), POLLED.timing, "simulated")
-    scene.charger = scene.make_charger()
-    scene.bus.add(scene.charger)
-    await scene.bus.start()
+    await scene.restart(away=10)
+    await known(scene)
+
+
+async def reloaded(scene: PolledScene) -> None:
+    """Restart in the same process, while the box has its quiet."""
+    await charging(scene)
+    await scene.restart(reload=True)
     await known(scene)
 
 
@@ -88,7 +88,9 @@ async def confirmation(dialect: Dialect, past: Past, offset: float, new: float) 
         assert all(a != b for a, b in pairwise(values)), f"written twice: {values}"
 
 
-@pytest.mark.parametrize("past", [steady, found, reconnected, restarted, box_restarted])
+@pytest.mark.parametrize(
+    "past", [steady, found, reconnected, restarted, reloaded, box_restarted]
+)
 @pytest.mark.parametrize("dialect", ALL)
 @pytest.mark.parametrize("new", [8.0, 14.0])
 def test_an_order_is_confirmed_in_time_and_not_written_again(

@@ -29,6 +29,7 @@ from ..charger import Charger
 from ..errors import GarbledReplyError, ImplausibleReplyError, WrongChargerError
 from ..exchange import Turn
 from ..limit_monitor import LimitMonitor
+from ..memory import LineMemory
 from ..model import (
     Capability,
     FailSafe,
@@ -45,8 +46,10 @@ from ..schedule import Kind
 from .config import (
     FOLLOW_TIME,
     INTERVAL_MARGIN,
+    MISSES_PER_LONG_PAUSE,
     SHORTEST_INTERVAL,
     TIMING,
+    UNKNOWN_INTERVAL,
     EvboxConfig,
 )
 from .frames import (
@@ -57,6 +60,7 @@ from .frames import (
     encode_68,
     encode_69,
 )
+from .memory import EvboxMemory
 from .plausibility import AcceptedReply, Plausibility, used_currents
 from .readings import charger_info, connectors, same_serial, serial_number
 
@@ -135,7 +139,10 @@ class EvboxCharger(Charger[EvboxConfig]):
         none is expected yet."""
         self._wrong_charger: WrongChargerError | None = None
         """The reason why nothing more is sent."""
-        self._sent_at: float | None = None
+        self._memory = EvboxMemory()
+        """That of the line, once it is on a bus."""
+        self._not_before = -inf
+        """Loop time until which nothing is sent: it does not answer."""
         self._timeout_at = inf
         """Loop time at which the box falls back unless it gets a request."""
         self._confirmed: Setpoint | None = None
@@ -197,6 +204,19 @@ class EvboxCharger(Charger[EvboxConfig]):
     def longest_request(self) -> int:
         """Return the length of a request, bytes."""
         return LONGEST_REQUEST[self.config.command]
+
+    @override
+    def resume(self, memory: LineMemory) -> None:
+        self._memory = memory.of(EvboxMemory)
+        self._plausibility.interval = self._memory.interval(self.config.addressed)
+
+    @property
+    def _sent_at(self) -> float:
+        """Return the loop time of the last request that it may have received, or -inf.
+
+        Another bus or a search on this line may have sent it.
+        """
+        return self._memory.sent_at(self.config.addressed)
 
     @override
     def on_line_open(self) -> None:
@@ -273,7 +293,7 @@ class EvboxCharger(Charger[EvboxConfig]):
         return reply
 
     def _on_sent(self, at: float, setpoint: Setpoint, *, answered: bool) -> None:
-        self._sent_at = at
+        self._memory.sent(self.config.addressed, at)
         self._monitor.sent(at, setpoint.currents, answered=answered)
         timeout_at = at + setpoint.fail_safe_timeout
         if answered:
@@ -394,9 +414,8 @@ class EvboxCharger(Charger[EvboxConfig]):
     @override
     def minimum_pause(self, now: float) -> float:
         """Return the rest of the minimum interval since our last request, s."""
-        if self._sent_at is None:
-            return 0.0
-        return max(self._sent_at + self._shortest_period - now, 0.0)
+        earliest = max(self._sent_at + self._shortest_period, self._not_before)
+        return max(earliest - now, 0.0)
 
     @override
     def plan(self, now: float) -> None:
@@ -411,9 +430,8 @@ class EvboxCharger(Charger[EvboxConfig]):
             or self._monitor.unconfirmed
             or self._other_serial is not None
         )
-        sent_at = now if self._sent_at is None else self._sent_at
         period = self._shortest_period if soon else self._period
-        slot.ready = slot.due = sent_at + period
+        slot.ready = slot.due = max(self._sent_at + period, now)
         slot.start_by = max(self._deadline, slot.ready)
 
     def _postpone_poll(self, now: float) -> None:
@@ -426,6 +444,9 @@ class EvboxCharger(Charger[EvboxConfig]):
     @override
     def on_missed(self, now: float, why: str) -> None:
         """Retry after the minimum interval, and still before the time-out."""
+        if (self.misses + 1) % MISSES_PER_LONG_PAUSE == 0:
+            # It may be another box, silent because it is asked too often.
+            self._not_before = self._sent_at + UNKNOWN_INTERVAL + INTERVAL_MARGIN
         super().on_missed(now, why)
         if self._wrong_charger is not None:
             self._stop()

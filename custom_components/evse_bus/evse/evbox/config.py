@@ -37,6 +37,10 @@ TIMING: Final = Timing(
 
 UNKNOWN_INTERVAL: Final = 20
 """Minimum interval until a reply reports one, s (the manual's example)."""
+MISSES_PER_LONG_PAUSE: Final = 30
+"""After so many unanswered requests there is one pause of `UNKNOWN_INTERVAL`: the
+interval that was reported may be another box's, and a request too soon may begin it
+anew. Rare, because of the power failure above."""
 SHORTEST_INTERVAL: Final = 1
 """Used where a box reports 0, s: even the shortest exchange takes 0.25 s."""
 INTERVAL_MARGIN: Final = 0.1

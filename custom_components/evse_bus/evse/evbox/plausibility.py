@@ -137,6 +137,11 @@ class ConfirmedValue:
         return self.reported is not None and self.reported > self.value
 
 
+def new_interval() -> ConfirmedValue:
+    """Return the minimum interval of a ChargePoint that has not reported one, s."""
+    return ConfirmedValue(UNKNOWN_INTERVAL)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AcceptedReply:
     """A reply that is plausible, or confirmed by others."""
@@ -177,8 +182,8 @@ class Plausibility:
         """Start without a reply."""
         self.maximum = ConfirmedValue(MINIMUM_CURRENT)
         """Maximum of the connection, A; 6 A until two replies agree on more."""
-        self.interval = ConfirmedValue(UNKNOWN_INTERVAL)
-        """Minimum interval, s."""
+        self.interval = new_interval()
+        """Minimum interval, s; replaced by that of an earlier bus on the line."""
         self.minimum = ConfirmedValue(MINIMUM_CURRENT)
         """Smallest minimum required current of the modules, A."""
         self.meters = Meters()

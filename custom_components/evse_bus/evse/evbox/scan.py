@@ -23,13 +23,13 @@ from ..scan import FoundCharger, ScanResult
 from .charger import encode_request, setpoint_for
 from .config import INTERVAL_MARGIN, UNKNOWN_INTERVAL, EvboxConfig
 from .frames import ANY_SERIAL, EvboxFrame, Reply, decode_reply
+from .memory import EvboxMemory
 from .plausibility import implausible_values
 from .readings import charger_info, serial_number
 
 TRIES: Final = 2
 RETRY_PAUSE = UNKNOWN_INTERVAL + INTERVAL_MARGIN
-"""Between two tries, s. A ChargePoint may have received the first one although its
-reply was unreadable, and its reaction to a second one too soon is not documented."""
+"""Between two tries where no minimum interval is known, s."""
 _PROGRESS_STEP: Final = 0.5
 """s"""
 
@@ -53,7 +53,10 @@ async def scan(
 ) -> ScanResult:
     """Send these orders to the addressed ChargePoints, and return those that reply.
 
-    Takes one second with a reply, 23 s without. Raises RefusedOrderError for orders
+    Takes one second with a reply, 23 s without. A ChargePoint may have received a probe
+    although its reply was unreadable, and its reaction to another one too soon is not
+    documented: so there is a minimum interval between two. After an earlier search that
+    found one, or a bus that was stopped a moment ago, its rest comes first. Raises RefusedOrderError for orders
     that cannot be sent, and for a probe of all ChargePoints on a bus that has chargers
     already; LineError when the line cannot be used.
     """
@@ -65,23 +68,41 @@ async def scan(
         raise RefusedOrderError(message)
     limits = Limits(installation=config.installation_limit, reports_maximum=True)
     request = encode_request(config, setpoint_for(orders, limits, UNKNOWN_INTERVAL))
+    memory = bus.line.memory.of(EvboxMemory)
+    known = memory.interval(config.addressed).reported is not None
     answers = _Answers()
     for number in range(TRIES):
-        if number:
-            await _pause(progress)
+        if number or known:
+            await _wait(memory, config, partial(_share, progress, number))
         answers = await bus.run(partial(_probe, bus, config, request))
         if answers.replies:
             break
     progress(1.0)
+    _learn(memory, config, answers)
     return _result(config, answers)
 
 
-async def _pause(progress: Progress) -> None:
+def _share(progress: Progress, number: int, share: float) -> None:
+    progress((number + share) / TRIES)
+
+
+async def _wait(memory: EvboxMemory, config: EvboxConfig, progress: Progress) -> None:
+    """Wait for the rest of the minimum interval since the last request."""
     loop = asyncio.get_running_loop()
-    start = loop.time()
-    while (passed := loop.time() - start) < RETRY_PAUSE:
-        progress(passed / RETRY_PAUSE)
-        await asyncio.sleep(min(_PROGRESS_STEP, RETRY_PAUSE - passed))
+    interval = memory.interval(config.addressed)
+    known = interval.reported is not None
+    pause = interval.value + INTERVAL_MARGIN if known else RETRY_PAUSE
+    ends = memory.sent_at(config.addressed) + pause
+    while (left := ends - loop.time()) > 0:
+        progress(1.0 - left / pause)
+        await asyncio.sleep(min(_PROGRESS_STEP, left))
+
+
+def _learn(memory: EvboxMemory, config: EvboxConfig, answers: _Answers) -> None:
+    """Keep the minimum intervals for the chargers that are set up next."""
+    for reply in answers.replies:
+        for address in {_address(config, reply), config.addressed}:
+            memory.interval(address).update(reply.minimum_interval)
 
 
 async def _probe(bus: Bus, config: EvboxConfig, request: bytes, turn: Turn) -> _Answers:
@@ -109,6 +130,10 @@ async def _probe(bus: Bus, config: EvboxConfig, request: bytes, turn: Turn) -> _
             answers.noise = True
     except ReplyTimeoutError:
         pass
+    finally:
+        if turn.sent_at is not None:
+            memory = bus.line.memory.of(EvboxMemory)
+            memory.sent(config.addressed, turn.sent_at)
     return answers
 
 

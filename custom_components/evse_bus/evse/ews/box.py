@@ -96,6 +96,14 @@ class Snapshot:
     installation: Installation
 
 
+@dataclass(slots=True)
+class BoxMemory:
+    """What is known of the box on one line, kept from one bus to the next."""
+
+    bcc: Bcc | None = None
+    """The checksum it uses; ``None``: not known. It is the first that is tried."""
+
+
 class EwsBox:
     """The box of one bus."""
 
@@ -110,8 +118,8 @@ class EwsBox:
         """Info records received."""
         self.restarts = 0
         """Restarts that the box has reported."""
-        self.bcc: Bcc | None = None
-        """The checksum it uses; ``None``: not known."""
+        self.memory = BoxMemory()
+        """That of its line, once it is on a bus."""
         self.meters: Pair[Meter] = (Meter(), Meter())
         """Of the ports. They stay while it is away: another box's totals jump."""
         self.sessions: Pair[SessionMeter] = (SessionMeter(), SessionMeter())
@@ -160,6 +168,11 @@ class EwsBox:
             # The checksum it answered to last is tried first.
             self._tries = 0
             self.forget()
+
+    @property
+    def bcc(self) -> Bcc | None:
+        """Return the checksum it uses; ``None``: not known."""
+        return self.memory.bcc
 
     @property
     def identified(self) -> bool:
@@ -343,7 +356,7 @@ class EwsBox:
             return None if firmware is None else (firmware, frame.bcc)
 
         request = read(CommandId.READ_FIRMWARE_ID).encode(bcc)
-        self.firmware, self.bcc = await turn.exchange(request, accept)
+        self.firmware, self.memory.bcc = await turn.exchange(request, accept)
         self._tries = 0
         self._answers = True
         self._note_answered(turn)

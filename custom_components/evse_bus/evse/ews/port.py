@@ -22,8 +22,9 @@ from ..errors import (
 )
 from ..exchange import Turn
 from ..master import ChargerGroup
+from ..memory import LineMemory
 from ..model import Fault, Orders
-from .box import EwsBox
+from .box import BoxMemory, EwsBox
 from .config import EwsPortConfig
 from .timing import COMMAND_MARGIN, COMMAND_TIMEOUT, TIMING
 from .wire.frames import LONGEST_FRAME, CommandId, Request
@@ -41,6 +42,10 @@ class BoxPorts(ChargerGroup):
         self.box = EwsBox()
         self.on_wrong_box = on_wrong_box
         self._ports: list[BoxPort] = []
+
+    @override
+    def resume(self, memory: LineMemory) -> None:
+        self.box.memory = memory.of(BoxMemory)
 
     @override
     def added(self, charger: Charger) -> None:

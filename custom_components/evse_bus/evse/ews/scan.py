@@ -18,7 +18,7 @@ from ..errors import (
 from ..model import ChargerConfig, Orders
 from ..protocol import Progress
 from ..scan import FoundCharger, ScanResult
-from .box import EwsBox
+from .box import BoxMemory, EwsBox
 from .readings import charger_info, limits_of
 
 TRIES: Final = 4
@@ -34,6 +34,7 @@ async def scan(
     """
     del config, orders
     box = EwsBox()
+    box.memory = bus.line.memory.of(BoxMemory)
     unreadable = 0
     progress(0.0)
     for attempt in range(TRIES):

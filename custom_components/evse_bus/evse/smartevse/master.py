@@ -22,10 +22,12 @@ from ..errors import ExchangeError, LineBusyError, NotAvailableError
 from ..exchange import Request, Turn
 from ..framing import Frame
 from ..master import BusMaster
+from ..memory import LineMemory
 from ..modbus import ModbusFrame
 from ..model import Circuit, Fault
 from ..safety import Setpoint
 from .balancing import CURRENTS, broadcast, decode_request, is_foreign_broadcast
+from .memory import SmartEvseMemory
 from .registers import LONGEST_REQUEST, tenths
 from .sharing import (
     LOWEST,
@@ -150,7 +152,10 @@ class Master(BusMaster):
         """Units that were read, or did not reply, since we began to read them."""
         self._values: tuple[int, ...] = ()
         """Values of the last broadcast, 0.1 A."""
-        self._sent_at = -inf
+        self._memory = SmartEvseMemory()
+        """That of the line, once it is on a bus."""
+        self._has_sent = False
+        """One of the broadcasts so far was ours, not of an earlier bus."""
         self._echoes: list[tuple[float, bytes]] = []
         """Our broadcasts whose echo may still come, and when they were sent."""
         self._is_planned = False
@@ -197,6 +202,15 @@ class Master(BusMaster):
     def slaves(self) -> list[Slave]:
         """Return the slaves of this bus."""
         return list(self._slaves)
+
+    @override
+    def resume(self, memory: LineMemory) -> None:
+        self._memory = memory.of(SmartEvseMemory)
+
+    @property
+    def _sent_at(self) -> float:
+        """Return the loop time of our last broadcast, of this bus or an earlier one."""
+        return self._memory.broadcast_at
 
     @override
     def added(self, charger: Charger) -> None:
@@ -383,7 +397,8 @@ class Master(BusMaster):
                 # Until it has confirmed that, no other slave can go up.
                 slave.read_soon(now)
         frame = broadcast(setpoints)
-        self._sent_at = now
+        self._memory.broadcast_at = now
+        self._has_sent = True
         self._echoes = [one for one in self._echoes if now - one[0] <= ECHO]
         self._echoes.append((now, frame))
         self._broadcast_sent.set()
@@ -471,6 +486,9 @@ class Master(BusMaster):
             return
         if now - self._sent_at < STILL_CHARGING:
             # The slaves still charge by our last broadcast: the next one comes soon.
+            if not self._has_sent:
+                # What an earlier bus has left them is not known.
+                self._forget(now + STOPS_ALONE)
             self._start_reading(now)
             return
         self._phase = _Phase.LISTENING

@@ -31,6 +31,7 @@ from ..errors import (
     SupersededError,
 )
 from ..exchange import Request, Turn
+from ..memory import LineMemory
 from ..model import (
     MINIMUM_CURRENT,
     Command,
@@ -49,6 +50,7 @@ from ..schedule import Kind
 from .charger import SmartEvseCharger
 from .config import PolledConfig
 from .dialects import MAPS, Dialect, Status
+from .memory import SmartEvseMemory
 from .mode import mode_conversation
 from .reader import READ_AGAIN, TIMING, WRITES
 from .registers import tenths, write_current
@@ -80,9 +82,8 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
     def __init__(self, config: PolledConfig, orders: Orders) -> None:
         """Begin with an unknown box."""
         super().__init__(config, orders)
-        self._needs_quiet = False
-        self._last_request = -inf
-        """Loop time of the last request on the line."""
+        self._line_memory = LineMemory()
+        """That of the line, once it is on a bus."""
         self._burst_until = -inf
         """Loop time until which a turn may join the burst that has begun."""
         self._written: int | None = None
@@ -115,15 +116,22 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
 
     def _rest_of_quiet(self, now: float) -> float:
         """Return the time until the box has had its quiet, s."""
-        if self.dialect is not None:
-            self._needs_quiet = self.dialect is Dialect.LATER
         if not self._needs_quiet:
             return 0.0
-        # Any request counts, to any address and from any of our chargers.
-        sent_at = self.bus.wire.sent_at if self.bus is not None else None
-        if sent_at is not None:
-            self._last_request = max(self._last_request, sent_at)
-        return max(0.0, self._last_request + QUIET - now)
+        # Any request counts: to any address, of another bus before, or of a search.
+        return max(0.0, self._line_memory.sent_at + QUIET - now)
+
+    @property
+    def _needs_quiet(self) -> bool:
+        """Return whether it needs quiet; before it is known, as the last box here."""
+        memory = self._line_memory.of(SmartEvseMemory)
+        if self.dialect is not None:
+            memory.needs_quiet = self.dialect is Dialect.LATER
+        return memory.needs_quiet
+
+    @override
+    def resume(self, memory: LineMemory) -> None:
+        self._line_memory = memory
 
     @override
     def plan(self, now: float) -> None:

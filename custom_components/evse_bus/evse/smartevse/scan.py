@@ -4,6 +4,7 @@ Every box can be read without being set up, so the configuration and orders that
 protocols need to search are not used here.
 """
 
+import asyncio
 from functools import partial
 from typing import Final
 
@@ -24,6 +25,8 @@ from ..registers import Block
 from ..scan import FoundCharger, ScanResult
 from .balancing import SLAVES
 from .dialects import MAPS, Dialect, Status
+from .memory import SmartEvseMemory
+from .polled import QUIET
 from .probing import Read, find_dialect
 from .readings import charger_info
 from .registers import (
@@ -37,6 +40,8 @@ POLLED_UNITS: Final = (1, 0)
 """The addresses of a box without load balancing and of one that is its own master, the
 more common one first. At 0 only 2.17 (and some of 2.20) replies, alone on its bus.
 Slaves stop without a master's broadcast, so there is nothing to poll."""
+POLL_FIRST: Final = 0.1
+"""Pause between the end of the quiet of a running box and the first request, s."""
 ATTEMPTS: Final = 2
 """Requests to a unit that does not reply."""
 ATTEMPTS_ON_BAD_LINE: Final = 4
@@ -54,6 +59,12 @@ async def scan_polled(
     Raises LineLostError when the port is lost meanwhile.
     """
     del config, orders
+    memory = bus.line.memory
+    if memory.of(SmartEvseMemory).needs_quiet:
+        # A box that was found or polled a moment ago gets its quiet first. If it is
+        # being polled, its next poll and the search are one burst.
+        quiet = memory.sent_at + QUIET + POLL_FIRST - bus.now
+        await asyncio.sleep(max(quiet, 0.0))
     found: list[FoundCharger] = []
     garbled: list[int] = []
     progress(0.0)
@@ -122,7 +133,7 @@ async def _search(bus: Bus, unit: int) -> tuple[FoundCharger | None, bool]:
     silent = garbled = busy = 0
     while silent < ATTEMPTS and silent + garbled + busy < ATTEMPTS_ON_BAD_LINE:
         try:
-            return await bus.run(partial(_identify_in_a_turn, unit)), False
+            charger, dialect = await bus.run(partial(_identify_in_a_turn, unit))
         except GarbledReplyError:
             garbled += 1
         except ReplyTimeoutError:
@@ -132,12 +143,15 @@ async def _search(bus: Bus, unit: int) -> tuple[FoundCharger | None, bool]:
         except ImplausibleReplyError, ExchangeRefusedError:
             # Another Modbus device has this address.
             return None, False
+        else:
+            memory = bus.line.memory.of(SmartEvseMemory)
+            memory.needs_quiet |= dialect is Dialect.LATER
+            return charger, False
     return None, garbled >= ATTEMPTS
 
 
-async def _identify_in_a_turn(unit: int, turn: Turn) -> FoundCharger:
-    charger, _ = await _identify(unit, partial(_read, unit, turn))
-    return charger
+async def _identify_in_a_turn(unit: int, turn: Turn) -> tuple[FoundCharger, Dialect]:
+    return await _identify(unit, partial(_read, unit, turn))
 
 
 async def _identify(unit: int, read: Read) -> tuple[FoundCharger, Dialect]:

@@ -1,0 +1,186 @@
+"""Quiet and broadcasts across searches and reloads of the bus."""
+
+import asyncio
+
+from hypothesis import given, settings, strategies as st
+import pytest
+
+from custom_components.evse_bus.evse.bus import Bus
+from custom_components.evse_bus.evse.smartevse import POLLED
+from custom_components.evse_bus.evse.smartevse.dialects import Dialect
+from custom_components.evse_bus.evse.smartevse.master import STILL_CHARGING
+from custom_components.evse_bus.evse.smartevse.polled import QUIET
+from custom_components.evse_bus.evse.smartevse.sharing import STOPS_ALONE
+from tests.simulated_time import now, simulate
+
+from .polled_scene import ALL, LATER, PolledScene
+from .scene import MasterScene
+from .test_polled_quiet import quiets
+
+NO_COMM = 2
+
+
+async def search(scene: PolledScene) -> int:
+    """Search the bus of the scene; return how many boxes were found."""
+    config, orders = scene.charger.config, scene.charger.orders
+    report = await POLLED.scan(scene.bus, config, orders, lambda _share: None)
+    return len(report.found)
+
+
+async def search_alone(scene: PolledScene) -> int:
+    """Search on a bus of its own, as a flow does where none runs."""
+    await scene.bus.stop()
+    scene.bus = Bus(scene.line, POLLED.framer(), POLLED.timing, "search")
+    await scene.bus.start()
+    return await search(scene)
+
+
+@pytest.mark.parametrize("dialect", ALL)
+@pytest.mark.parametrize("after", [0.0, 1.3, 20.0])
+def test_after_a_search(dialect: Dialect, after: float) -> None:
+    """A later box has its quiet before it is polled; others are polled at once."""
+
+    async def run() -> None:
+        scene = PolledScene(dialect)
+        async with scene:
+            await scene.settled()
+            assert await search_alone(scene) == 1
+            searched = scene.line.sent[-1].when
+            await asyncio.sleep(after)
+            opened = now()
+            await scene.restart(reload=True)
+            await scene.until(lambda: scene.charger.available, QUIET + 1)
+            first = next(one for one in scene.line.sent if one.when >= opened)
+            if dialect is LATER:
+                assert first.when - max(searched + QUIET, opened) < 0.1
+                assert first.when - searched >= QUIET
+            else:
+                assert first.when - opened < 0.1
+
+    simulate(run())
+
+
+@pytest.mark.parametrize("after", [0.3, 3.0, 6.4])
+def test_a_reload_keeps_the_quiet(after: float) -> None:
+    async def run() -> None:
+        scene = PolledScene(LATER)
+        async with scene:
+            await scene.settled()
+            await scene.charge()
+            await scene.polled(3)
+            last = len(scene.line.sent)
+            await scene.until(lambda: len(scene.line.sent) > last)
+            await asyncio.sleep(after)
+            await scene.restart(reload=True)
+            await asyncio.sleep(30)
+            assert min(quiets(scene)) >= QUIET - 0.1
+
+    simulate(run())
+
+
+def test_a_search_beside_a_running_box_is_one_burst_with_its_poll() -> None:
+    async def run() -> None:
+        scene = PolledScene(LATER)
+        async with scene:
+            await scene.settled()
+            await scene.polled(2)
+            for pause in (1.0, 5.0, 9.0):
+                await asyncio.sleep(pause)
+                assert await search(scene) == 1
+            await asyncio.sleep(10)
+            assert min(quiets(scene)) >= QUIET - 0.1
+            # The search itself takes 2 s, most of them at an address without a box.
+            assert max(quiets(scene)) < QUIET + 1.0
+
+    simulate(run())
+
+
+_EVENTS = st.lists(
+    st.tuples(
+        st.sampled_from(("reload", "search", "alone", "unplug")),
+        st.floats(0.0, 12.0),
+    ),
+    min_size=1,
+    max_size=8,
+)
+
+
+@settings(max_examples=25)
+@given(events=_EVENTS)
+def test_whatever_happens_a_later_box_does_not_stop_with_no_comm(
+    events: list[tuple[str, float]],
+) -> None:
+    async def run() -> None:
+        scene = PolledScene(LATER)
+        errors: list[int] = []
+        async with scene:
+            await scene.settled()
+            await scene.charge()
+            await scene.polled(3)
+            scene.on_step.append(lambda: errors.append(scene.outlet.error))
+            for event, pause in events:
+                if event == "reload":
+                    await scene.restart(reload=True)
+                elif event == "search":
+                    await search(scene)
+                elif event == "alone":
+                    await search_alone(scene)
+                    await scene.restart(reload=True)
+                else:
+                    scene.line.unplug()
+                await asyncio.sleep(pause)
+            await asyncio.sleep(30)
+            assert not any(error & NO_COMM for error in errors)
+            assert scene.charger.available
+
+    simulate(run())
+
+
+@pytest.mark.parametrize("away", [0.0, 2.0, 4.0, 6.0])
+def test_slaves_go_on_across_a_reload(away: float) -> None:
+    """The next broadcast does not wait until it is sure that there is no master."""
+
+    async def run() -> None:
+        async with MasterScene() as scene:
+            await asyncio.sleep(5)
+            await scene.charge(2, 3)
+            await asyncio.sleep(4)
+            last = scene.broadcasts()[-1].when
+            await scene.bus.stop()
+            await asyncio.sleep(away)
+            if now() - last > STILL_CHARGING - 0.5:
+                return
+            scene.new_bus(reload=True)
+            scene.add(2)
+            scene.add(3)
+            await scene.bus.start()
+            begin = now()
+            while now() - begin < 20:
+                await asyncio.sleep(0.02)
+                offers = [box.offers for box in scene.line.boxes.values()]
+                assert offers == [8.0, 8.0]
+            first = next(one.when for one in scene.broadcasts(begin))
+            assert first - begin < 1.0
+
+    simulate(run())
+
+
+def test_after_a_reload_nothing_goes_up_before_all_are_known() -> None:
+    """What an earlier bus has left a slave is not remembered: it may draw anything."""
+
+    async def run() -> None:
+        async with MasterScene(limit=20.0) as scene:
+            await asyncio.sleep(5)
+            await scene.charge(2, 3)
+            await asyncio.sleep(3)
+            await scene.bus.stop()
+            scene.box(3).deaf = scene.box(3).mute = True
+            scene.new_bus(reload=True)
+            scene.add(2)
+            scene.add(3)
+            await scene.bus.start()
+            begin = now()
+            await scene.until(lambda: scene.box(2).offers > 10)
+            assert now() - begin >= STOPS_ALONE
+
+    simulate(run())
