@@ -6,6 +6,7 @@ The oracle are the virtual boxes: which writes have reached which of them.
 import asyncio
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -21,6 +22,7 @@ from custom_components.evse_bus.evse.address_change import (
     Problem,
 )
 from custom_components.evse_bus.evse.errors import (
+    EvseError,
     LineLostError,
     NotAvailableError,
     RefusedOrderError,
@@ -436,11 +438,12 @@ async def test_a_caller_that_gives_up_in_the_middle() -> None:
         assert (one.device_id, one.state) == (2, "A1")
 
 
-async def test_a_bus_that_stops_in_the_middle_still_resets_the_box() -> None:
+@pytest.mark.parametrize("value", [E2, 0xF002])
+async def test_a_bus_that_stops_in_the_middle_still_resets_the_box(value: int) -> None:
     one = box()
     async with Scene(one) as scene:
         changing = asyncio.create_task(change(scene))
-        await until(lambda: one.state == "E2", LONG)
+        await until(lambda: value in written(one), LONG)
         await scene.bus.stop()
         assert (one.device_id, one.state) == (2, "A1")
         changing.cancel()
@@ -487,6 +490,27 @@ async def test_a_deaf_box_takes_its_time() -> None:
         assert await change(scene) == AddressChanged(serial=FIRST)
 
 
+@pytest.mark.parametrize("round_trip", [0.1, 0.32, 0.8, 1.5])
+async def test_a_slow_adapter(round_trip: float) -> None:
+    one = box(turn_round=round_trip)
+    async with Scene(one) as scene:
+        assert await change(scene) == AddressChanged(serial=FIRST)
+        assert (one.device_id, one.state) == (2, "A1")
+
+
+@pytest.mark.parametrize("seed", range(20))
+async def test_a_line_with_byte_errors(seed: int) -> None:
+    one = box()
+    async with Scene(one) as scene:
+        scene.virtual.rng.seed(seed)
+        scene.virtual.faults.byte_error_rate = 1e-3
+        for _ in range(3):
+            with suppress(AddressChangeError):
+                await change(scene, serial=FIRST)
+                break
+        assert (one.device_id, one.state) == (2, "A1")
+
+
 async def test_a_late_confirmation_of_the_reset_says_nothing_of_the_line() -> None:
     one = box(boot_time=2.0)
     one.reset_answer = "after"
@@ -516,6 +540,36 @@ async def test_a_charger_follows_its_box() -> None:
         await until(lambda: charger.available and one.ic_amps < 10.1)
         assert charger.pending_cleanup is None
         assert charger.noticed == frozenset()
+
+
+async def test_a_pause_by_a_limit_is_ended_by_a_limit_all_the_same() -> None:
+    one = box()
+    async with Scene(one) as scene:
+        charger = await scene.settled(config(serial=FIRST), orders(10))
+        await charger.change_orders(OrderChange(current=0))
+        await change(scene)
+        await until(lambda: charger.available and one.ic_amps == 0)
+        await charger.change_orders(OrderChange(current=8))
+        await until(lambda: 0 < one.ic_amps < 8.1)
+
+
+@pytest.mark.parametrize("value", [E2, 0xF002, RESET])
+async def test_an_order_that_comes_meanwhile_reaches_no_other_box(value: int) -> None:
+    one, two = box(boot_time=3.0), box(serial=SECOND, boot_time=0.05)
+    two.on = False
+    async with Scene(one, two) as scene:
+        charger = await scene.settled(config(serial=FIRST), orders(10))
+        changing = asyncio.create_task(change(scene))
+        await until(lambda: value in written(one), LONG)
+        if value == RESET:
+            await until(lambda: one.resets, LONG)
+            two.switch_on()
+            await asyncio.sleep(0.2)
+        with pytest.raises(EvseError):
+            await charger.change_orders(OrderChange(current=16, allowed=True))
+        assert two.writes == []
+        assert (await changing).serial == FIRST
+        assert two.writes == []
 
 
 async def test_a_charger_in_e0_stays_disabled() -> None:

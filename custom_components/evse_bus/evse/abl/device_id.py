@@ -77,8 +77,10 @@ MOST_DOUBTS: Final = 5
 """Requests without a readable reply, not all of them silent, until that is the result."""
 WRITES: Final = 3
 """Attempts at each write; each one after a look at the box."""
-STATE_READS: Final = 3
-"""Readings of the state before it counts as not reached, or as without a car."""
+STATE_LOOKS: Final = 3
+"""Readings of the state that show that no car is plugged in."""
+STATE_READS: Final = 4
+"""Requests until a state counts as not readable."""
 BOOT_PATIENCE: Final = 20.0
 """Longest time from the reset until the box is found, s."""
 LONGEST_TURN: Final = 3
@@ -336,7 +338,7 @@ class DeviceIdChange:
     # -- Set-up ------------------------------------------------------------------------
 
     async def _enter_set_up(self, turn: Turn) -> None:
-        for _ in range(STATE_READS - 1):
+        for _ in range(STATE_LOOKS - 1):
             await self._check_state(turn)
             await self._rest(turn, self._pauses.verify)
         self._require_caller()
@@ -413,6 +415,8 @@ class DeviceIdChange:
         self.stage = stage
         if self._own is None:
             return
+        # An order that comes meanwhile must not be sent to another box there.
+        self._own.invalidate()
         leave = StateCode.A1 if stage is _Stage.SET_UP else StateCode.RESET
         self._own.pending_cleanup = (
             Cleanup(StateCode.E0) if self._was_disabled else Cleanup(leave, E2)
