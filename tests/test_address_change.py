@@ -482,7 +482,7 @@ async def test_a_bus_that_does_not_run_offers_only_the_settings(
 def test_each_problem_has_a_text_in_both_flows() -> None:
     for texts in (english()["config"], english()["config_subentries"]["charger"]):
         named = {key for key in texts["error"] if key.startswith("address_")}
-        # Nobody sees the one of a flow that was closed.
+        # The last one is of a flow that was closed.
         problems = {f"address_{one}" for one in Problem if one is not Problem.GIVEN_UP}
         others = {"address_not_begun", "address_taken", "address_twice"}
         assert named == problems | others

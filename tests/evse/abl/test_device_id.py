@@ -428,6 +428,26 @@ async def test_a_caller_that_gives_up_before_the_first_write() -> None:
         assert one.writes == []
 
 
+async def test_one_change_at_a_time() -> None:
+    one, three = box(), box(3, THIRD)
+    async with Scene(one, three) as scene:
+        first = asyncio.create_task(change(scene, 1, 2))
+        await asyncio.sleep(1)
+        with pytest.raises(NotAvailableError, match="another device-ID"):
+            await change(scene, 3, 2)
+        await until(lambda: one.state == "E2", LONG)
+        # Its caller has gone; the change has not.
+        first.cancel()
+        with pytest.raises(NotAvailableError, match="another device-ID"):
+            await change(scene, 3, 2)
+        await until(lambda: one.state == "A1" and one.device_id == 2, LONG)
+        assert three.writes == []
+        await asyncio.sleep(20)
+        assert await problem(scene, 3, 2) is Problem.IN_USE
+        await change(scene, 3, 4)
+        assert (one.device_id, three.device_id) == (2, 4)
+
+
 async def test_a_caller_that_gives_up_in_the_middle() -> None:
     one = box()
     async with Scene(one) as scene:

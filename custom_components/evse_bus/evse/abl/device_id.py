@@ -14,6 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import Enum, IntEnum
 from typing import Final
+from weakref import WeakSet
 
 from ..address_change import (
     AddressChange,
@@ -86,6 +87,8 @@ BOOT_PATIENCE: Final = 20.0
 LONGEST_TURN: Final = 3
 """Exchanges of one turn: state, serial number, write."""
 
+_CHANGING: Final = WeakSet[Bus]()
+"""The buses on which a device-ID is being changed."""
 _PLUGGED: Final = frozenset({B1, B2, C2, C3, C4})
 
 
@@ -150,12 +153,11 @@ class DeviceIdChange:
     """One change of a device-ID, as a conversation."""
 
     def __init__(
-        self, change: AddressChange, readers: Iterable[AblCharger], exchange_time: float
+        self, change: AddressChange, bus: Bus, readers: Iterable[AblCharger]
     ) -> None:
         """``readers``: the chargers set up at either device-ID; their polls wait.
 
-        ``exchange_time``: longest time of one exchange on this line, s. Raises
-        RefusedOrderError for an invalid device-ID.
+        Raises RefusedOrderError for an invalid device-ID.
         """
         if not {change.old, change.new} <= set(ADDRESSES) or change.old == change.new:
             message = f"device-ID {change.old} cannot become {change.new}"
@@ -167,19 +169,32 @@ class DeviceIdChange:
         self.given_up = False
         """Its caller has gone: nothing is written unless it has begun."""
         self.progress: Progress = lambda _share: None
+        self._bus = bus
         self._readers = tuple(readers)
         self._own: AblCharger | None = None
         """The charger set up for this box."""
         self._serial = ""
         self._was_disabled = False
-        self._worst_case = LONGEST_TURN * exchange_time
+        self._worst_case = LONGEST_TURN * bus.wire.exchange_time()
         self._pauses: Pauses = AblCharger.pauses
 
     async def run(self, turn: Turn) -> AddressChanged:
-        """Carry it out; a conversation.
+        """Carry it out, one change of a bus at a time; a conversation.
 
-        Raises AddressChangeError, and what an exchange raises.
+        Two at once might give one device-ID to two boxes. Raises AddressChangeError,
+        NotAvailableError, and what an exchange raises.
         """
+        if self._bus in _CHANGING:
+            message = f"another device-ID is being changed on {self._bus.name}"
+            raise NotAvailableError(message)
+        _CHANGING.add(self._bus)
+        try:
+            return await self._run(turn)
+        finally:
+            # Also when the bus ends it, whether or not its caller still waits.
+            _CHANGING.discard(self._bus)
+
+    async def _run(self, turn: Turn) -> AddressChanged:
         if await self._is_at_new_already(turn):
             self.stage = _Stage.WRITTEN
         else:
@@ -318,7 +333,7 @@ class DeviceIdChange:
             await self._leave_set_up(turn)
 
     async def _check_state(self, turn: Turn) -> None:
-        """Raise unless the box is in A1, or in E0 and the user vouches for the rest."""
+        """Raise unless it is in A1, or in E0 and the user has confirmed the rest."""
         status = await self._read_state(turn, self.change.old)
         if status is None:
             raise self._failed(Problem.NO_REPLY, "its state cannot be read")
@@ -661,7 +676,7 @@ async def change_device_id(
         if isinstance(one, AblCharger)
         and one.config.address in (change.old, change.new)
     ]
-    sequence = DeviceIdChange(change, readers, bus.wire.exchange_time())
+    sequence = DeviceIdChange(change, bus, readers)
     sequence.progress = progress
     owner = next((one for one in readers if one.config.address == change.old), None)
     try:
