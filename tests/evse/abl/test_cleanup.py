@@ -5,11 +5,26 @@ import asyncio
 import pytest
 
 from custom_components.evse_bus.evse.abl.charger import AblCharger
-from custom_components.evse_bus.evse.errors import EvseError, NotConfirmedError
-from custom_components.evse_bus.evse.model import Command, OrderChange
+from custom_components.evse_bus.evse.errors import (
+    EvseError,
+    NotConfirmedError,
+    WrongChargerError,
+)
+from custom_components.evse_bus.evse.model import Command, Fault, OrderChange
 from tests.virtual import AblBox, Car, Request
 
-from .scene import LIMIT, STATE, Scene, box_with, config, orders, sleepy, until
+from .scene import (
+    FOREVER,
+    LIMIT,
+    STATE,
+    Scene,
+    answers,
+    box_with,
+    config,
+    orders,
+    sleepy,
+    until,
+)
 
 RESET, A1, E0 = 0x5A5A, 0xA1A1, 0xE0E0
 PAUSE = 1000
@@ -172,3 +187,41 @@ async def test_a_box_that_stays_in_set_up_mode_is_led_out_of_it() -> None:
             await charger.command(Command.SET_UPSTREAM_TIMEOUT, value=True)
         await until(lambda: box.state == "A1")
         assert scene.writes(STATE)[-1] == A1
+
+
+async def swapped(box: AblBox, charger: AblCharger) -> None:
+    """Have a box that is being woken replaced by another, after a missed reply."""
+    await until(lambda: box.state == "E0")
+    if charger.slot.ready > FOREVER:
+        # The read at the end of the rest is the one that is missed, and its repeat.
+        answers(box, "good", "lose", "lose")
+    else:
+        box.faults.dead = True
+        await until(lambda: charger.misses > 0)
+        box.faults.dead = False
+    box.serial = "2W22xy99999999"
+
+
+@pytest.mark.parametrize("polls", [True, False])
+async def test_a_box_swapped_in_a_rest_gets_no_write(
+    polls: bool,  # noqa: FBT001
+) -> None:
+    box = box_with(sleepy())
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(serial=box.serial), orders())
+        await until(lambda: box.state == "B2")
+        await scene.polled(charger)
+        if not polls:
+            await scene.stop_polls(charger)
+        waking = asyncio.create_task(charger.command(Command.WAKE))
+        await swapped(box, charger)
+        with pytest.raises(WrongChargerError):
+            await waking
+        await asyncio.sleep(5)
+        # The first box had E0; the other one is left as it is.
+        assert scene.writes() == [E0]
+        assert Fault.WRONG_CHARGER in charger.faults
+        box.serial = "2W22xy01234567"
+        charger.slot.ready = 0
+        scene.bus.reschedule()
+        await until(lambda: box.state != "E0", 60)

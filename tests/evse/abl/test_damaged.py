@@ -153,8 +153,8 @@ def wrong(box: AblBox, charger: AblCharger, *, paused: bool) -> list[str]:
     found = []
     if charger.info is not None and charger.info.serial != box.serial:
         found.append(f"serial {charger.info.serial}")
-    if charger.highest not in (None, 16.0):
-        found.append(f"highest {charger.highest}")
+    if charger.box.highest not in (None, 16.0):
+        found.append(f"highest {charger.box.highest}")
     if Fault.OVERCURRENT in charger.noticed or Fault.LIMIT_EXCEEDED in charger.noticed:
         found.append(f"{charger.noticed}")
     if (reading := charger.reading) is None:

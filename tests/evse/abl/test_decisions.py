@@ -12,6 +12,7 @@ from custom_components.evse_bus.evse.abl.decisions import (
     Standing,
     Writes,
     decide,
+    is_taken,
 )
 from custom_components.evse_bus.evse.model import OrderState
 
@@ -194,7 +195,7 @@ def test_row_8_ic_confirms_a_limit(state: int, ic: int) -> None:
     assert decide(silent(ic, state), limit()).paused is (False if state == C2 else None)
     # A raise ordered meanwhile goes out where it cannot end a pause.
     raised = decide(silent(ic, state), limit(raised=True))
-    assert raised.write is (state == C2)
+    assert raised.write is (state == C2 and ic < LIMIT)
 
 
 @pytest.mark.parametrize("state", [C2, C3, C4, 0xA0])
@@ -278,6 +279,71 @@ def test_an_icmax_that_is_not_known_now_holds(state: int) -> None:
             assert not decide(seen, order).write
 
 
+@pytest.mark.parametrize("state", [*IDLE, C2])
+@pytest.mark.parametrize("ic", [DEFAULT, LIMIT, LOWER])
+def test_a_limit_ends_the_pause_of_our_limit_alone(state: int, ic: int) -> None:
+    for seen in (reports(PAUSE, ic, state), silent(ic, state)):
+        assert decide(seen, limit(raised=True, ends_pause=True)).write
+    # That the order before was a pause does not prove whose pause stands.
+    assert not decide(reports(PAUSE, ic, state), limit(after_pause=True)).write
+    order = limit(after_pause=True, raised=True, confirmed=True, missed=True)
+    if state != C2:
+        decision = decide(silent(ic, state), order)
+        assert summary(decision) == (NOT_READ_BACK, None, False)
+
+
+@pytest.mark.parametrize("state", [*IDLE, C2])
+def test_a_pause_is_repeated_after_a_limit_that_may_still_take_effect(
+    state: int,
+) -> None:
+    order = pause(acknowledged=1)
+    seen = reports(PAUSE, state=state, charging_for=60.0)
+    assert not decide(seen, order).write
+    assert decide(seen, replace(order, unsettled=True)).write
+
+
+@pytest.mark.parametrize(
+    ("seen", "order", "taken", "at_last", "as_start"),
+    [
+        # A pause that is read back is below any limit, but no start.
+        (reports(PAUSE), pause(), True, True, True),
+        (reports(PAUSE), limit(), True, True, False),
+        (silent(PAUSE), limit(), True, True, False),
+        (reports(LIMIT), limit(), True, True, True),
+        (reports(HIGHER), limit(), False, False, False),
+        # A raise is waited for.
+        (reports(LOWER), limit(), False, True, False),
+        (reports(LIMIT), pause(), False, False, False),
+        (reports(None), limit(acknowledged=0), False, False, False),
+        # By Ic alone, and only after an acknowledged write.
+        (silent(LIMIT), limit(acknowledged=0), True, True, True),
+        (silent(LOWER), limit(acknowledged=0), True, True, True),
+        (silent(LIMIT), limit(), False, False, False),
+        (silent(DEFAULT), limit(acknowledged=0), False, False, False),
+        (silent(0), limit(acknowledged=0), False, False, False),
+        (silent(DEFAULT), pause(acknowledged=0), True, True, True),
+        (silent(DEFAULT, C2), pause(acknowledged=0), False, False, False),
+        (
+            Evidence(state=B2, ic=LIMIT, reports_icmax=None),
+            limit(acknowledged=0),
+            False,
+            False,
+            False,
+        ),
+    ],
+)
+def test_what_confirms_a_write(
+    seen: Evidence,
+    order: Standing,
+    taken: bool,  # noqa: FBT001
+    at_last: bool,  # noqa: FBT001
+    as_start: bool,  # noqa: FBT001
+) -> None:
+    assert is_taken(seen, order, starts=False, is_last=False) is taken
+    assert is_taken(seen, order, starts=False, is_last=True) is at_last
+    assert is_taken(seen, order, starts=True, is_last=False) is as_start
+
+
 _evidence = st.builds(
     Evidence,
     state=st.integers(0, 0xFF),
@@ -292,7 +358,9 @@ _standing = st.builds(
     code=st.just(PAUSE) | st.integers(100, 970),
     acknowledged=st.none() | st.floats(0, 100),
     state_changed=st.booleans(),
+    unsettled=st.booleans(),
     raised=st.booleans(),
+    after_pause=st.booleans(),
     confirmed=st.booleans(),
     missed=st.booleans(),
     allowed=st.booleans(),

@@ -5,7 +5,7 @@ again (Icmax does not survive a power cycle), by the rules of `decisions`; permi
 is never given without the user (PROTOCOLS.md, 2).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final, override
 
@@ -25,12 +25,13 @@ from ..model import (
 from ..safety import clamp
 from .commands import conversation_for
 from .config import AblConfig
-from .decisions import FAILED_AFTER, WRITE_PAUSES, Decision, believed_paused
+from .decisions import FAILED_AFTER, WRITE_PAUSES, Decision, Standing
 from .duty import PAUSE
-from .reader import ICMAX_PROBES, AblReader
+from .evidence import ICMAX_PROBES
 from .registers import Reading, StateCode, limit_duty
 from .states import E0, E2, SETUP, is_failure
 from .steps import reach_state, refuse_in, restore
+from .writer import AblWriter
 
 GARBLED_REPLIES: Final = 3
 """Unreadable replies in a row that suggest two boxes with one device-ID."""
@@ -63,7 +64,7 @@ class _ActiveCommand:
     name: str
 
 
-class AblCharger(AblReader):
+class AblCharger(AblWriter):
     """One ABL wallbox."""
 
     def __init__(self, config: AblConfig, orders: Orders) -> None:
@@ -97,7 +98,7 @@ class AblCharger(AblReader):
     @override
     def limits(self) -> Limits:
         return Limits(
-            installation=self.config.installation_limit, reported=self.highest
+            installation=self.config.installation_limit, reported=self.box.highest
         )
 
     @property
@@ -141,10 +142,10 @@ class AblCharger(AblReader):
             # The fail-safe may be above the limit: raised to it once, and never in a
             # box that is paused or disabled.
             self._fell_back = True
-            self.raise_pending = decision.paused is not True and status.state != E0
+            self.box.raised = decision.paused is not True and status.state != E0
             decision = self.decide(now) or decision
         self._note(decision)
-        if decision.write and now >= self.writes.due(self.code):
+        if decision.write and now >= self.box.writes.due(self.code):
             return FollowUp(self._reassert)
         return None
 
@@ -155,9 +156,8 @@ class AblCharger(AblReader):
         elif not decision.write and decision.state is not None:
             self.notice(Fault.LIMIT_NOT_TAKEN, present=False)
         if decision.state is OrderState.CONFIRMED:
-            if self.code != PAUSE:
-                self.confirmed = self.code
-            self.missed = False
+            self.box.note_confirmed(self.code)
+            self.box.missed = False
 
     # -- Orders ------------------------------------------------------------------
 
@@ -165,24 +165,24 @@ class AblCharger(AblReader):
     async def apply(self, turn: Turn, orders: Orders, change: OrderChange) -> None:
         with self.conversing():
             await self.identify(turn)
-            status = self.last_status
+            status = self.box.status
             if change.allowed is not False or status is None or self.misses:
                 # A pause by the user waits for no other exchange.
                 status = await self.read_status(turn)
-                await self._require_icmax(turn, status)
+                await self._require_icmax(turn)
             enables = change.allowed is True and self.may_enable_again
             if change.allowed is True and not enables:
                 self._require_startable(status)
             if change.allowed is False:
                 await self.note_pause(by_limit=False)
-                self.allowed_by_user = False
+                self.box.allowed_by_user = False
             paused = clamp(orders, self.limits).paused and orders.allowed is not False
-            if not self._may_write(status, turn.now, orders, change):
+            if not self._may_write(turn.now, orders, change):
                 if paused and change.allowed is True:
                     await self.note_pause(by_limit=True)
                 return
             ends_own_pause = self.paused_by_our_limit
-            self.writes.restart(turn.now)
+            self.box.writes.restart(turn.now)
             await self.apply_setpoint(
                 turn,
                 lambda: clamp(self.order_to_send(change), self.limits),
@@ -194,23 +194,24 @@ class AblCharger(AblReader):
                 )
             self._fell_back = False
             if change.allowed is True:
-                self.allowed_by_user = True
-                self.missed = False
+                self.box.allowed_by_user = True
+                self.box.missed = False
             await self.note_pause(by_limit=paused)
 
-    async def _require_icmax(self, turn: Turn, status: Reading) -> None:
+    async def _require_icmax(self, turn: Turn) -> None:
         """Raise ReplyTimeoutError for a box whose Icmax and maximum are not known yet.
 
         A box that reports them is never sent more than its maximum, and a limit never
         ends a pause.
         """
         for _ in range(ICMAX_PROBES):
-            if self.reports_icmax is False:
+            if self.box.reports_icmax is False:
                 return
-            if self.highest is not None and self.evidence(status, turn.now).icmax:
+            seen = self.box.seen(turn.now)
+            if self.box.highest is not None and seen and seen.icmax:
                 return
             await self.read_icmax(turn)
-        if self.reports_icmax is not False:
+        if self.box.reports_icmax is not False:
             message = f"{self.config.name} does not answer a read of its Icmax"
             raise ReplyTimeoutError(message)
 
@@ -224,49 +225,44 @@ class AblCharger(AblReader):
             why = "the outlet is disabled, enable it first"
             raise refuse_in(self, status, "abl_outlet_disabled", why)
 
-    def _may_write(
-        self, status: Reading, now: float, orders: Orders, change: OrderChange
-    ) -> bool:
-        """Return whether the set-point of a change is written in this status.
+    def _may_write(self, now: float, orders: Orders, change: OrderChange) -> bool:
+        """Return whether the set-point of a change is written in the status just read.
 
         False: the orders are only stored, and count when the box lets a car charge
         again. A limit change never starts a car. Raises NotAvailableError in set-up
         mode.
         """
-        if status.state in SETUP:
-            raise refuse_in(self, status, "abl_setup_mode", "set-up mode")
-        if is_failure(status.state):
-            # Sent when the failure is over.
-            self.raise_pending = True
-            return False
-        code = limit_duty(clamp(orders, self.limits))
-        seen = self.evidence(status, now)
-        paused = believed_paused(seen)
-        if code == PAUSE:
-            return paused is not True or not self.writes.settled(code, now)
-        if change.allowed is True:
-            return True
+        box = self.box
+        if box.status is not None and box.status.state in SETUP:
+            raise refuse_in(self, box.status, "abl_setup_mode", "set-up mode")
         changes_limit = change.current is not None or any(
             phase is not None for phase in change.phases
         )
-        if paused is True or (paused is None and self.setpoint.paused):
-            # A limit ends only the pause of our own limit of 0 A.
-            writes = (
-                changes_limit
-                and self.paused_by_our_limit
-                and orders.allowed is not False
-            )
-        elif paused is None:
-            # Perhaps paused by another, but not in C.
-            writes = not seen.idle and seen.ic != code
-        else:
-            raises = seen.icmax is not None and seen.icmax < code
-            writes = seen.icmax != code and not (
-                raises
-                and (status.state == E0 or not (changes_limit or self._fell_back))
-            )
-        self.raise_pending = changes_limit and not writes
-        return writes
+        order = self._order_of(orders, now, changes_limit=changes_limit)
+        decision = box.decide(order, now)
+        if decision is None or decision.state is None:
+            # Sent when the failure is over.
+            box.raised = True
+            return False
+        if order.code == PAUSE:
+            return decision.write or decision.state is not OrderState.CONFIRMED
+        if change.allowed is True:
+            return True
+        box.raised = changes_limit and not decision.write
+        return decision.write
+
+    def _order_of(self, orders: Orders, now: float, *, changes_limit: bool) -> Standing:
+        """Return changed orders as one that is about to stand."""
+        code = limit_duty(clamp(orders, self.limits))
+        ends_pause = (
+            changes_limit and self.paused_by_our_limit and orders.allowed is not False
+        )
+        return replace(
+            self.box.standing(code, now),
+            raised=changes_limit or self._fell_back,
+            ends_pause=ends_pause,
+            after_pause=self.setpoint.paused,
+        )
 
     async def _reassert(self, turn: Turn) -> None:
         """Write the order again to a box that does not have it (any more)."""
@@ -277,7 +273,7 @@ class AblCharger(AblReader):
             if decision is None or not decision.write:
                 # A command of the user came first, or it was only late.
                 return
-            failed = self.writes.failed(self.code, turn.now)
+            failed = self.box.writes.failed(self.code, turn.now)
             was_paused = decision.paused is True
             await self.apply_setpoint(
                 turn,
@@ -286,7 +282,7 @@ class AblCharger(AblReader):
             )
             by_limit = self.effective_orders.allowed is not False
             # The orders may have changed since.
-            if self.writes.code == PAUSE and by_limit and not was_paused:
+            if self.box.writes.code == PAUSE and by_limit and not was_paused:
                 await self.note_pause(by_limit=True)
 
     # -- Commands ----------------------------------------------------------------

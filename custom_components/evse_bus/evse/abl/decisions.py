@@ -6,7 +6,7 @@ but not a pause: it then stays at Idefault (PROTOCOLS.md, 2). Not every box answ
 Pure functions of what was read and of what has been written; all times in seconds.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from typing import Final
 
@@ -80,8 +80,14 @@ class Standing:
     """Time since the last acknowledged write of it; ``None``: none since connecting."""
     state_changed: bool = False
     """The state has changed since that acknowledged write."""
+    unsettled: bool = False
+    """Another one was written just now, and may still take effect."""
     raised: bool = False
     """It is higher than the one before, and has not been written yet."""
+    ends_pause: bool = False
+    """A limit of ours has paused the box for certain, and this one ends that."""
+    after_pause: bool = False
+    """The order before it was a pause."""
     confirmed: bool = False
     """A limit of ours has been read back since connecting."""
     missed: bool = False
@@ -131,19 +137,46 @@ def believed_paused(seen: Evidence) -> bool | None:
     return False if seen.reports_icmax and seen.icmax else None
 
 
+def is_taken(seen: Evidence, order: Standing, *, starts: bool, is_last: bool) -> bool:
+    """Return whether what was read after a write of an order confirms it.
+
+    ``starts``: a pause that is read back does not count as below. ``is_last``: there
+    is no more time to wait for a raise.
+    """
+    if PAUSE in (seen.ic, seen.icmax):
+        return order.code == PAUSE or not starts
+    if seen.reports_icmax:
+        if seen.icmax is None or order.code == PAUSE:
+            return False
+        return seen.icmax == order.code or (is_last and seen.icmax < order.code)
+    # One that may still show that Icmax can be read confirms nothing yet.
+    if order.acknowledged is None or seen.reports_icmax is None:
+        return False
+    return seen.idle if order.code == PAUSE else 0 < seen.ic <= order.code
+
+
 def _paused(seen: Evidence, order: Standing) -> Decision:
     """Rows 14, 1 and 2: the pause is in a register."""
     if order.code != PAUSE:
-        # Only the user's "allow" ends it.
-        return Decision(state=OrderState.PAUSED_ELSEWHERE, paused=True, offered=PAUSE)
-    confirmed = Decision(state=OrderState.CONFIRMED, paused=True, offered=PAUSE)
+        # Else only the user's "allow" ends it.
+        state = (
+            OrderState.NOT_READ_BACK
+            if order.ends_pause
+            else OrderState.PAUSED_ELSEWHERE
+        )
+        return Decision(state=state, paused=True, offered=PAUSE, write=order.ends_pause)
     if seen.idle or seen.ic == PAUSE:
-        return confirmed
+        return Decision(
+            state=OrderState.CONFIRMED,
+            paused=True,
+            offered=PAUSE,
+            write=order.unsettled,
+        )
     return Decision(
         state=OrderState.NOT_TAKEN if order.charges else OrderState.CONFIRMED,
         paused=True,
         offered=PAUSE,
-        write=_write_in_c(seen, order),
+        write=order.unsettled or _write_in_c(seen, order),
     )
 
 
@@ -209,24 +242,32 @@ def _pause_not_read_back(seen: Evidence, order: Standing) -> Decision:
 
 def _limit_by_ic(seen: Evidence, order: Standing) -> Decision:
     """Rows 8 to 11: a limit on a box that shows its Ic alone."""
+    if order.ends_pause:
+        return replace(_held(paused=None, offered=seen.ic), write=True)
     within = _LOWEST <= seen.ic <= order.code
-    # In C no pause stands; elsewhere Ic does not show whether one does.
-    paused = False if not seen.idle else None
-    if within and seen.reports_icmax is False:
-        return Decision(
-            state=OrderState.CONFIRMED,
-            paused=False if order.allowed else paused,
-            offered=seen.ic,
-            write=order.raised and not seen.idle,
-        )
-    if not seen.idle:
-        if not within:
-            return _lost(order, paused=False, offered=seen.ic)
-        return _held(paused=False, offered=seen.ic)
-    if within or seen.reports_icmax is not False:
-        return _held(paused=None, offered=seen.ic)
-    if order.confirmed and order.missed and seen.ic:
+    if seen.idle:
+        return _limit_when_idle(seen, order, within=within)
+    # In C no pause stands.
+    if not within:
         return _lost(order, paused=False, offered=seen.ic)
+    if seen.reports_icmax is not False:
+        return _held(paused=False, offered=seen.ic)
+    return Decision(
+        state=OrderState.CONFIRMED,
+        paused=False,
+        offered=seen.ic,
+        write=order.raised and seen.ic < order.code,
+    )
+
+
+def _limit_when_idle(seen: Evidence, order: Standing, *, within: bool) -> Decision:
+    """Rows 8, 10 and 11: Ic does not show whether a pause stands."""
+    if not order.after_pause and seen.reports_icmax is False:
+        if within:
+            paused = False if order.allowed else None
+            return Decision(state=OrderState.CONFIRMED, paused=paused, offered=seen.ic)
+        if order.confirmed and order.missed and seen.ic:
+            return _lost(order, paused=False, offered=seen.ic)
     # Perhaps paused by another: a write would end that.
     return _held(paused=None, offered=seen.ic)
 

@@ -41,7 +41,7 @@ from ..schedule import Kind
 from .charger import AblCharger
 from .collect import collect
 from .config import Pauses
-from .reader import Cleanup, read
+from .reader import read
 from .registers import (
     ADDRESSES,
     CONFIGURATION_REGISTER,
@@ -57,6 +57,7 @@ from .registers import (
 )
 from .states import A1, B1, B2, C2, C3, C4, E0, E2, state_of
 from .steps import hold_polls, recover
+from .writer import Cleanup
 
 CLEAN_REPLIES: Final = 10
 """Clean replies in a row, with one serial number, that prove a box to be alone."""

@@ -15,7 +15,6 @@ from ..errors import (
     ReplyTimeoutError,
 )
 from ..exchange import Turn
-from .reader import AblReader, Cleanup
 from .registers import Reading, StateCode
 from .states import A1, E0, E2
 from .steps import (
@@ -27,6 +26,7 @@ from .steps import (
     rest_without_polls,
     restore,
 )
+from .writer import AblWriter, Cleanup
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,50 +38,50 @@ class Settings:
     """A plugged car must be enabled anew after a power cycle."""
 
 
-async def change_settings(reader: AblReader, settings: Settings, turn: Turn) -> None:
+async def change_settings(writer: AblWriter, settings: Settings, turn: Turn) -> None:
     """Write settings in E2, reset the box, and check that it has taken them.
 
     Raises NotAvailableError in a state without E2 and without a serial number,
     NotConfirmedError.
     """
-    before = await reach(reader, turn)
-    _check_ready(reader, before)
+    before = await reach(writer, turn)
+    _check_ready(writer, before)
     was_disabled = before.state == E0
-    reader.pending_cleanup = (
+    writer.pending_cleanup = (
         Cleanup(StateCode.E0) if was_disabled else Cleanup(StateCode.A1, E2)
     )
     try:
-        await _write(reader, turn, settings)
+        await _write(writer, turn, settings)
     except EvseError:
         # Leave E2 after any error.
         with suppress(EvseError):
-            await restore(reader, turn)
+            await restore(writer, turn)
         raise
-    await recover(reader, turn, was_disabled=was_disabled)
-    await reader.read_flags(turn)
-    _check_taken(reader, settings)
+    await recover(writer, turn, was_disabled=was_disabled)
+    await writer.read_flags(turn)
+    _check_taken(writer, settings)
 
 
-def _check_ready(reader: AblReader, status: Reading) -> None:
+def _check_ready(writer: AblWriter, status: Reading) -> None:
     """Raise NotAvailableError for a box whose settings cannot be changed now."""
     if status.state not in (A1, E0):
         why = "settings are changed in A1 or E0"
-        raise refuse_in(reader, status, "abl_settings_state", why)
-    if reader.serial is None:
+        raise refuse_in(writer, status, "abl_settings_state", why)
+    if writer.serial is None:
         message = (
-            f"{reader.config.name} has no serial number: it cannot be distinguished "
+            f"{writer.config.name} has no serial number: it cannot be distinguished "
             "from another box with the same device-ID"
         )
         raise NotAvailableError(message, "abl_no_serial")
 
 
-async def _write(reader: AblReader, turn: Turn, settings: Settings) -> None:
+async def _write(writer: AblWriter, turn: Turn, settings: Settings) -> None:
     """Go to E2, write the settings, and reset the box."""
-    hold_polls(reader, turn)
-    await reach_state(reader, turn, StateCode.E2, lambda now: now.state == E2)
-    await rest_without_polls(reader, turn, reader.pauses.settings)
+    hold_polls(writer, turn)
+    await reach_state(writer, turn, StateCode.E2, lambda now: now.state == E2)
+    await rest_without_polls(writer, turn, writer.pauses.settings)
     write = partial(
-        reader.set_configuration,
+        writer.set_configuration,
         turn,
         upstream_timeout=settings.upstream_timeout,
         needs_enable=settings.needs_enable,
@@ -91,16 +91,16 @@ async def _write(reader: AblReader, turn: Turn, settings: Settings) -> None:
     except ReplyTimeoutError:
         # Not readable before the reset; to write the same value again is harmless.
         await write()
-    await rest_without_polls(reader, turn, reader.pauses.settings)
-    if not await reader.set_state(turn, StateCode.RESET):
+    await rest_without_polls(writer, turn, writer.pauses.settings)
+    if not await writer.set_state(turn, StateCode.RESET):
         with suppress(ReplyTimeoutError):
-            if (await reader.read_status(turn)).state == E2:
-                await reader.set_state(turn, StateCode.RESET)
+            if (await writer.read_status(turn)).state == E2:
+                await writer.set_state(turn, StateCode.RESET)
 
 
-def _check_taken(reader: AblReader, settings: Settings) -> None:
+def _check_taken(writer: AblWriter, settings: Settings) -> None:
     """Raise NotConfirmedError when a setting has not been taken."""
-    options = reader.info.options if reader.info is not None else {}
+    options = writer.info.options if writer.info is not None else {}
     enable = None if settings.needs_enable is None else not settings.needs_enable
     wanted = {
         "upstream_timeout": settings.upstream_timeout,
@@ -108,5 +108,5 @@ def _check_taken(reader: AblReader, settings: Settings) -> None:
     }
     for name, value in wanted.items():
         if value is not None and options.get(name) is not value:
-            message = f"{reader.config.name} did not take {name} = {value}"
+            message = f"{writer.config.name} did not take {name} = {value}"
             raise NotConfirmedError(message)

@@ -17,9 +17,9 @@ from ..errors import (
 )
 from ..exchange import Turn
 from .duty import PAUSE
-from .reader import AblReader
 from .registers import Reading, StateCode, limit_duty
 from .states import E0, E2, SETUP, state_of
+from .writer import AblWriter
 
 REACH_ATTEMPTS: Final = 3
 """Attempts to reach a box that may be asleep."""
@@ -29,136 +29,135 @@ STATE_READS: Final = 4
 """Reads of a state before it counts as not reached."""
 
 
-async def reach(reader: AblReader, turn: Turn) -> Reading:
+async def reach(writer: AblWriter, turn: Turn) -> Reading:
     """Wake the box and return its status; repeats are safe: nothing is written yet."""
     for _ in range(REACH_ATTEMPTS - 1):
         with suppress(ReplyTimeoutError):
-            return await _contact(reader, turn)
-        await rest(reader.pauses.retry)
-    return await _contact(reader, turn)
+            return await _contact(writer, turn)
+        await rest(writer.pauses.retry)
+    return await _contact(writer, turn)
 
 
-async def _contact(reader: AblReader, turn: Turn) -> Reading:
-    await reader.identify(turn)
-    return await reader.read_status(turn)
+async def _contact(writer: AblWriter, turn: Turn) -> Reading:
+    await writer.identify(turn)
+    return await writer.read_status(turn)
 
 
-def hold_polls(reader: AblReader, turn: Turn) -> None:
+def hold_polls(writer: AblWriter, turn: Turn) -> None:
     """Postpone the next poll: the box restarts or is being set up."""
-    slot = reader.slot
-    slot.ready = max(slot.ready, turn.now + 2 * reader.pauses.boot)
+    slot = writer.slot
+    slot.ready = max(slot.ready, turn.now + 2 * writer.pauses.boot)
 
 
-async def rest_without_polls(reader: AblReader, turn: Turn, pause: float) -> None:
+async def rest_without_polls(writer: AblWriter, turn: Turn, pause: float) -> None:
     """Rest for a time, s, in which the box is not polled."""
-    hold_polls(reader, turn)
+    hold_polls(writer, turn)
     await rest(pause)
-    hold_polls(reader, turn)
+    hold_polls(writer, turn)
 
 
 def refuse_in(
-    reader: AblReader, status: Reading, text_key: str, why: str
+    writer: AblWriter, status: Reading, text_key: str, why: str
 ) -> NotAvailableError:
     """Return the error for a command that is not possible in a state."""
     state = state_of(status.state).name
-    message = f"{reader.config.name} is in state {state}: {why}"
+    message = f"{writer.config.name} is in state {state}: {why}"
     return NotAvailableError(message, text_key, state=state)
 
 
 async def reach_state(
-    reader: AblReader, turn: Turn, code: StateCode, reached: Callable[[Reading], bool]
+    writer: AblWriter, turn: Turn, code: StateCode, reached: Callable[[Reading], bool]
 ) -> Reading:
     """Write a state code; return the status that shows its effect.
 
     Written again only while the state is not reached and no reply has come. Raises
     NotConfirmedError, and ExchangeRefusedError.
     """
-    confirmed = await reader.set_state(turn, code)
+    confirmed = await writer.set_state(turn, code)
     for _ in range(STATE_READS):
-        if reached(status := await reader.read_status(turn)):
+        if reached(status := await writer.read_status(turn)):
             return status
         if not confirmed:
-            confirmed = await reader.set_state(turn, code)
-        await rest(reader.pauses.verify)
-    if reached(status := await reader.read_status(turn)):
+            confirmed = await writer.set_state(turn, code)
+        await rest(writer.pauses.verify)
+    if reached(status := await writer.read_status(turn)):
         return status
-    message = f"{reader.config.name} does not change to {code.name}"
+    message = f"{writer.config.name} does not change to {code.name}"
     raise NotConfirmedError(message)
 
 
-async def recover(reader: AblReader, turn: Turn, *, was_disabled: bool) -> Reading:
+async def recover(writer: AblWriter, turn: Turn, *, was_disabled: bool) -> Reading:
     """Wait for a box after a reset, bring back limit and E0, and return its status.
 
     A reset ends in A1 with Idefault: neither the limit nor E0 has survived it.
     """
-    status = await _wait_for_boot(reader, turn)
+    status = await _wait_for_boot(writer, turn)
     # It allows charging now: no pause is left that could be ended.
-    status = await lower_limit(reader, turn, status, is_reset=True)
+    status = await lower_limit(writer, turn, status, is_reset=True)
     if was_disabled:
-        return await disable(reader, turn, status)
+        return await disable(writer, turn, status)
     if status.state != E2:
-        reader.pending_cleanup = None
+        writer.pending_cleanup = None
     return status
 
 
-async def _wait_for_boot(reader: AblReader, turn: Turn) -> Reading:
-    reader.invalidate()
+async def _wait_for_boot(writer: AblWriter, turn: Turn) -> Reading:
+    writer.invalidate()
     for _ in range(BOOT_ATTEMPTS - 1):
-        await rest_without_polls(reader, turn, reader.pauses.boot)
+        await rest_without_polls(writer, turn, writer.pauses.boot)
         with suppress(ReplyTimeoutError):
-            return await _contact(reader, turn)
-    await rest_without_polls(reader, turn, reader.pauses.boot)
-    return await _contact(reader, turn)
+            return await _contact(writer, turn)
+    await rest_without_polls(writer, turn, writer.pauses.boot)
+    return await _contact(writer, turn)
 
 
 async def lower_limit(
-    reader: AblReader, turn: Turn, status: Reading, *, is_reset: bool = False
+    writer: AblWriter, turn: Turn, status: Reading, *, is_reset: bool = False
 ) -> Reading:
     """Lower the limit to the set-point before a car can start; return the status.
 
     A limit above it that may hide the pause of another is left alone, but after a
     reset.
     """
-    code = limit_duty(reader.setpoint)
-    paused = reader.paused
-    if paused is True or status.state in SETUP:
+    code = limit_duty(writer.setpoint)
+    if writer.box.paused is True or status.state in SETUP:
         return status
-    decision = reader.decide(turn.now)
-    lost = decision is not None and decision.write and not reader.raise_pending
+    decision = writer.decide(turn.now)
+    lost = decision is not None and decision.write and not writer.box.raised
     if lost or code == PAUSE or (is_reset and status.duty > code):
-        return await reader.apply_setpoint(turn, lambda: reader.setpoint)
+        return await writer.apply_setpoint(turn, lambda: writer.setpoint)
     return status
 
 
-async def disable(reader: AblReader, turn: Turn, status: Reading) -> Reading:
+async def disable(writer: AblWriter, turn: Turn, status: Reading) -> Reading:
     """Disable the outlet, which ends any cleanup; return the status."""
     if status.state != E0:
         status = await reach_state(
-            reader, turn, StateCode.E0, lambda now: now.state == E0
+            writer, turn, StateCode.E0, lambda now: now.state == E0
         )
-    reader.pending_cleanup = None
+    writer.pending_cleanup = None
     return status
 
 
-async def restore(reader: AblReader, turn: Turn) -> None:
+async def restore(writer: AblWriter, turn: Turn) -> None:
     """Carry out the pending cleanup, if there is one; repeat a lost exchange.
 
     Raises NotConfirmedError.
     """
-    cleanup = reader.pending_cleanup
+    cleanup = writer.pending_cleanup
     if cleanup is None:
         return
     for _ in range(STATE_READS):
         with suppress(ExchangeError):
-            status = await reader.read_status(turn)
+            status = await writer.read_status(turn)
             if cleanup.is_needed(status.state):
                 if status.state == E0:
-                    await lower_limit(reader, turn, status)
-                await reader.set_state(turn, cleanup.code)
-                status = await reader.read_status(turn)
+                    await lower_limit(writer, turn, status)
+                await writer.set_state(turn, cleanup.code)
+                status = await writer.read_status(turn)
             if not cleanup.is_needed(status.state):
-                reader.pending_cleanup = None
+                writer.pending_cleanup = None
                 return
-        await rest(reader.pauses.verify)
-    message = f"{reader.config.name} does not leave its state"
+        await rest(writer.pauses.verify)
+    message = f"{writer.config.name} does not leave its state"
     raise NotConfirmedError(message)
