@@ -18,10 +18,8 @@ from custom_components.evse_bus import (
 )
 from custom_components.evse_bus.actions.table import ACTIONS
 from custom_components.evse_bus.evse.ews.box import Installation
-from custom_components.evse_bus.evse.ews.network.listener import (
-    IDENTIFY_TIME,
-    MOST_UNIDENTIFIED,
-)
+from custom_components.evse_bus.evse.ews.network.admission import PLACES
+from custom_components.evse_bus.evse.ews.network.listener import IDENTIFY_TIME
 from custom_components.evse_bus.evse.ews.readings import capabilities_of
 from custom_components.evse_bus.evse.ews.timing import (
     COMMAND_MARGIN,
@@ -104,7 +102,7 @@ def test_the_numbers_of_the_listener() -> None:
     page = words("docs/ews.md")
     assert f"{FIRST_PORT} is offered if it is free" in page
     assert (
-        f"within {IDENTIFY_TIME:g} s end, at most {MOST_UNIDENTIFIED} (and one for "
+        f"within {IDENTIFY_TIME:g} s end, at most {PLACES} (and one for "
         "each box that is set up) wait at once"
     ) in page
     assert f"drops the connection after {COMMAND_TIMEOUT:g} s" in page

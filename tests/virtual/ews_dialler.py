@@ -32,6 +32,7 @@ class EwsDialler(VirtualBus):
     - `retry`: real seconds between two attempts; `source_ports`: the first of ten, 0 =
       any (default: from the box's serial number)
     - `dropped`: reasons why connections ended, oldest first
+    - `source_host`: the address to dial from, where the machine has several ("": any)
     - `on`: another dialler, to run on its thread
     - `pace`: (bytes, real seconds) to send slowly
     """
@@ -44,6 +45,7 @@ class EwsDialler(VirtualBus):
         *,
         retry: float = 0.5,
         source_ports: int | None = None,
+        source_host: str = "",
         on: EwsDialler | None = None,
         **options: float | None,
     ) -> None:
@@ -52,6 +54,7 @@ class EwsDialler(VirtualBus):
         self._dial_port: DialPort | None = None
         self._connected_at = 0.0
         self.box = box
+        self.source_host = source_host
         self.dropped: list[str] = []
         if source_ports is None:
             span = (LAST_SOURCE_PORT - FIRST_SOURCE_PORT) // SOURCE_PORTS
@@ -74,6 +77,7 @@ class EwsDialler(VirtualBus):
                 self.adapter.from_client,
                 (host, port),
                 source_ports=self._source_ports,
+                source_host=lambda: self.source_host,
                 on_change=self._link_changed,
                 retry=retry,
             )

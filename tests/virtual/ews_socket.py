@@ -34,6 +34,7 @@ class DialPort:
         address: tuple[str, int],
         *,
         source_ports: Callable[[], list[int]],
+        source_host: Callable[[], str],
         on_change: Callable[[bool], None],
         retry: float,
     ) -> None:
@@ -42,6 +43,7 @@ class DialPort:
         self._on_bytes = on_bytes
         self._address = address
         self._source_ports = source_ports
+        self._source_host = source_host
         self._on_change = on_change
         self.retry = retry
         self.pace: tuple[int, float] | None = None
@@ -150,8 +152,8 @@ class DialPort:
         line.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         try:
-            if source:
-                line.bind(("", source))
+            if source or self._source_host():
+                line.bind((self._source_host(), source))
             result = line.connect_ex(self._address)
         except OSError as error:
             result = error.errno or errno.EIO

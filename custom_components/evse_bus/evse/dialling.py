@@ -4,7 +4,7 @@ A protocol whose boxes dial has a class with these methods, and declares how to 
 (`Protocol.listener`).
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from ipaddress import IPv4Address, IPv4Network, IPv6Address, IPv6Network
 from typing import Protocol
@@ -27,6 +27,8 @@ class UnknownBox:
 
 
 type UnknownBoxCallback = Callable[[UnknownBox], None]
+type NewAddressCallback = Callable[[str, tuple[Address, ...]], None]
+"""Called with a serial number, and the addresses of that box, the last one first."""
 
 
 @dataclass(slots=True)
@@ -40,6 +42,8 @@ class ListenerStatistics:
     """Dropped: too many unidentified connections."""
     unidentified: int = 0
     """Dropped: not identified, or not in time."""
+    over_budget: int = 0
+    """Dropped: sent more bytes than unidentified connections may."""
     unknown: int = 0
     """Of boxes that are not registered."""
     duplicates: int = 0
@@ -55,6 +59,8 @@ class Listener(Protocol):
     port: int
     allowed: tuple[Network, ...]
     statistics: ListenerStatistics
+    on_new_address: NewAddressCallback
+    """Called when a registered box dials from another address than last time."""
 
     @property
     def unknown_boxes(self) -> tuple[UnknownBox, ...]:
@@ -69,8 +75,18 @@ class Listener(Protocol):
     def allow(self, networks: Iterable[Network]) -> None:
         """Let only these networks connect; none: all may."""
 
-    def register(self, serial: str, name: str = "") -> Bus:
-        """Return the bus of a box, which waits until the box dials."""
+    @property
+    def addresses(self) -> Mapping[str, Address]:
+        """Return the last addresses of registered boxes, by serial number."""
+
+    def register(
+        self, serial: str, name: str = "", addresses: Iterable[Address] = ()
+    ) -> Bus:
+        """Return the bus of a box, which waits until the box dials.
+
+        ``addresses``: from which it has dialled before, the last one first. Places are
+        kept for them.
+        """
 
     async def unregister(self, serial: str) -> None:
         """Stop the bus of a box and forget the box."""

@@ -9,7 +9,10 @@ import pytest
 from custom_components.evse_bus.evse import recovery
 from custom_components.evse_bus.evse.events import KEYS
 from custom_components.evse_bus.evse.ews.box import MOST_KEYS
-from custom_components.evse_bus.evse.ews.network import listener as listening
+from custom_components.evse_bus.evse.ews.network import (
+    admission,
+    listener as listening,
+)
 from custom_components.evse_bus.evse.ews.network.line import AcceptedLine
 from custom_components.evse_bus.evse.ews.wire import frames
 from custom_components.evse_bus.evse.throttle import LOSSES
@@ -141,7 +144,7 @@ def test_a_slow_connection_ends(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_silent_connections_do_not_keep_boxes_out(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(listening, "GRACE", 0.1)
+    monkeypatch.setattr(admission, "GRACE", 0.1)
 
     async def scene() -> None:
         async with server() as made, expected(made) as bus:
@@ -152,7 +155,7 @@ def test_silent_connections_do_not_keep_boxes_out(
                 await until(lambda: has_reading(bus))
             assert made.statistics.crowded_out > 0
             # One more for the registered box.
-            assert len(made._unidentified) <= listening.MOST_UNIDENTIFIED + 1
+            assert len(made._unidentified) <= admission.PLACES + 1
             for one in silent:
                 one.close()
 
@@ -165,6 +168,7 @@ def test_many_connections_do_not_fill_the_log(
     """With the number of a box that is away, any device is taken for it."""
     monkeypatch.setattr(recovery, "PAUSES", (0.01,))
     monkeypatch.setattr(listening, "PROOF_PAUSE", 0.0)
+    monkeypatch.setattr(admission, "ADDRESS_BYTES", 1 << 20)
     cycles = LOSSES + 10
 
     async def scene() -> None:

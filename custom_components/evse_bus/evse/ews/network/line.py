@@ -36,10 +36,16 @@ class Connection(asyncio.Protocol):
         self,
         on_made: Callable[[Connection], None],
         on_gone: Callable[[Connection], None],
+        may_receive: Callable[[Connection, int], bool],
     ) -> None:
-        """Call ``on_made`` once it is open, and ``on_gone`` once it has ended."""
+        """Call ``on_made`` once it is open, and ``on_gone`` once it has ended.
+
+        ``may_receive`` is called with the number of bytes that have arrived at once;
+        it returns whether they may be looked at. If not, the connection ends.
+        """
         self._on_made = on_made
         self._on_gone = on_gone
+        self._may_receive = may_receive
         self._transport: asyncio.Transport | None = None
         self._waiting = b""
         self.line: AcceptedLine | None = None
@@ -60,7 +66,9 @@ class Connection(asyncio.Protocol):
 
     @override
     def data_received(self, data: bytes) -> None:
-        if self.line is not None:
+        if not self._may_receive(self, len(data)):
+            self.abort()
+        elif self.line is not None:
             self.line.received(data)
         elif len(self._waiting) + len(data) > MOST_BYTES:
             self.abort()
@@ -136,6 +144,8 @@ class AcceptedLine(Line):
         """``noise`` returns the bytes received that belong to no message."""
         super().__init__(name, SETTINGS)
         self.echoes = False
+        self.on_answered: Callable[[], None] = lambda: None
+        """Called with each reply."""
         self._noise = noise
         self._noise_before = 0
         self._bytes_before = 0
@@ -171,6 +181,11 @@ class AcceptedLine(Line):
         # The caller gets ready first, then come the bytes received so far.
         loop.call_soon(connection.hand_over)
 
+    @property
+    def peer(self) -> Address | None:
+        """Return the address of the other end; ``None``: it is not connected."""
+        return None if self._connection is None else self._connection.peer
+
     def release(self) -> None:
         """Give the connection up, for another line."""
         self._connection = None
@@ -201,8 +216,8 @@ class AcceptedLine(Line):
 
     def received(self, data: bytes) -> None:
         """Take bytes of the connection; too many without a reply end it."""
-        # Searching for messages takes long: garbage is searched in pieces, up to the
-        # limit that ends the connection.
+        # Garbage is searched for messages in pieces, up to the limit that ends the
+        # connection.
         for at in range(0, len(data), _PIECE):
             if self._connection is None:
                 return
@@ -215,6 +230,7 @@ class AcceptedLine(Line):
     @override
     def answered(self) -> None:
         self._note_progress()
+        self.on_answered()
         if self._proof is not None and not self._proof.done():
             self._proof.set_result(True)
 

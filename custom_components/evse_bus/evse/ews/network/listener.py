@@ -4,10 +4,11 @@ A box is asked for ``id`` and ``rs``, and for nothing else before its serial num
 known to be a registered one; then it belongs to the bus of that number. The protocol
 has no authentication: nothing here can tell a box from another device that gives its
 number. So a connection that answers keeps its number, and addresses can be restricted.
+Addresses of registered boxes are remembered: places are kept for them (`admission`).
 """
 
 import asyncio
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 import errno
@@ -22,6 +23,7 @@ from ...dialling import (
     Address,
     ListenerStatistics,
     Network,
+    NewAddressCallback,
     UnknownBox,
     UnknownBoxCallback,
 )
@@ -36,17 +38,13 @@ from ..port import BoxPorts
 from ..readings import charger_info
 from ..timing import TCP_TIMING
 from ..wire.frames import EwsFrame, EwsFramer, MessageId
+from .admission import Admission
 from .line import AcceptedLine, Connection
 
 _LOGGER = logging.getLogger(__name__)
 
 IDENTIFY_TIME: Final = 10.0
 """Longest time for a connection to be identified, s."""
-MOST_UNIDENTIFIED: Final = 16
-"""Most unidentified connections at once, beside one for each registered box: after a
-power failure all of them dial in the same moment."""
-GRACE: Final = 1.0
-"""An unidentified connection that is older may be dropped for a newer one, s."""
 MOST_UNKNOWN: Final = 8
 """Most connections of unknown boxes at once."""
 UNKNOWN_TIME: Final = 40.0
@@ -54,8 +52,15 @@ UNKNOWN_TIME: Final = 40.0
 once."""
 PROOF_TIME: Final = 10.0
 """Longest time for a connected box to answer when another gives its number, s."""
+PROOF_MARGIN: Final = 0.5
+"""Time for the same beside its reply time-out, when the other connection comes from the
+same address: then it is the box itself that has lost the first one, s."""
 PROOF_PAUSE: Final = 1.0
 """Shortest time between two such requests to one box, s."""
+ADDRESSES: Final = 3
+"""Addresses remembered of one box: another device may have given its number."""
+CROWD_LOGGED: Final = 3600.0
+"""Shortest time between two warnings of a crowd, s."""
 _MAPPED: Final = 96
 """Length of the prefix of an IPv4 address in the form of an IPv6 one, bits."""
 
@@ -67,6 +72,8 @@ class _RegisteredBox:
     bus: Bus
     line: AcceptedLine
     ports: BoxPorts
+    addresses: tuple[Address, ...]
+    """From which it has dialled, the last one first."""
 
 
 class Listener:
@@ -85,6 +92,7 @@ class Listener:
         ``allowed``: networks that may connect; none: all may. ``on_unknown_box`` is
         called each time an unregistered box dials.
         """
+        self.on_new_address: NewAddressCallback = lambda _serial, _addresses: None
         self.host = host
         self.port = port
         self.allowed = tuple(map(_plain, allowed))
@@ -92,8 +100,8 @@ class Listener:
         self.statistics = ListenerStatistics()
         self._server: asyncio.Server | None = None
         self._registered: dict[str, _RegisteredBox] = {}
-        self._unidentified: dict[Connection, float] = {}
-        """Open connections, and the loop times at which they were accepted."""
+        self._unidentified: set[Connection] = set()
+        self._admission = Admission[Connection](lambda: len(self._registered))
         self._identified: dict[Connection, UnknownBox] = {}
         """All other open connections."""
         self._unknown: dict[str, Connection] = {}
@@ -107,6 +115,7 @@ class Listener:
         self._proved_at: dict[str, float] = {}
         self._warned: set[str] = set()
         self._warnings = RateLimiter(LOSSES, LOSSES_WINDOW)
+        self._crowds = RateLimiter(1, CROWD_LOGGED)
 
     # -- Life ------------------------------------------------------------------------
 
@@ -126,7 +135,9 @@ class Listener:
         loop = asyncio.get_running_loop()
         try:
             self._server = await loop.create_server(
-                lambda: Connection(self._on_connection, self._on_gone),
+                lambda: Connection(
+                    self._on_connection, self._on_gone, self._may_receive
+                ),
                 self.host,
                 self.port,
             )
@@ -162,11 +173,14 @@ class Listener:
 
     # -- Registered boxes ------------------------------------------------------------
 
-    def register(self, serial: str, name: str = "") -> Bus:
+    def register(
+        self, serial: str, name: str = "", addresses: Iterable[Address] = ()
+    ) -> Bus:
         """Return the bus of a box; it waits until the box dials.
 
         The caller adds the ports and starts it. An unknown box of this number that is
-        connected already is used at once. ``name`` is for log messages.
+        connected already is used at once. ``name`` is for log messages;
+        ``addresses``: from which it has dialled before, the last one first.
         """
         if (known := self._registered.get(serial)) is not None:
             return known.bus
@@ -175,10 +189,13 @@ class Listener:
         # Otherwise it would keep out the box whose number it gave when it dialled.
         ports = BoxPorts(on_wrong_box=partial(line.end, "another box answers"))
         bus = Bus(line, framer, TCP_TIMING, name, group=ports)
-        self._registered[serial] = _RegisteredBox(bus, line, ports)
+        box = _RegisteredBox(bus, line, ports, tuple(addresses)[:ADDRESSES])
+        self._registered[serial] = box
+        self._keep_places()
         if (connection := self._unknown.pop(serial, None)) is not None:
             self._cancel_timer(connection)
             self._bound[serial] = connection
+            self._note_address(serial, box, connection.peer)
             line.attach(connection)
         return bus
 
@@ -186,7 +203,35 @@ class Listener:
         """Stop the bus of a box; the box is an unknown one from now on."""
         box = self._registered.pop(serial, None)
         if box is not None:
+            self._keep_places()
             await box.bus.stop()
+
+    @property
+    def addresses(self) -> Mapping[str, Address]:
+        """Return the addresses of registered boxes, by serial number.
+
+        That of a box that is not connected is the last one known.
+        """
+        return {
+            serial: box.line.peer or box.addresses[0]
+            for serial, box in self._registered.items()
+            if box.line.peer or box.addresses
+        }
+
+    def _keep_places(self) -> None:
+        boxes = self._registered.values()
+        self._admission.keep_for({one for box in boxes for one in box.addresses})
+
+    def _note_address(
+        self, serial: str, box: _RegisteredBox, address: Address | None
+    ) -> None:
+        """Remember the address from which a box has dialled."""
+        if address is None or box.addresses[:1] == (address,):
+            return
+        others = [one for one in box.addresses if one != address]
+        box.addresses = (address, *others)[:ADDRESSES]
+        self._keep_places()
+        self.on_new_address(serial, box.addresses)
 
     @property
     def unknown_boxes(self) -> tuple[UnknownBox, ...]:
@@ -200,18 +245,24 @@ class Listener:
             self.statistics.not_allowed += 1
             connection.abort()
             return
-        if not self._has_room():
+        now = asyncio.get_running_loop().time()
+        admitted, leaves = self._admission.enter(connection, connection.peer, now)
+        if leaves is not None:
+            leaves.abort()
+        if leaves is not None or not admitted:
             self.statistics.crowded_out += 1
+            self._warn_of_crowd(now)
+        if not admitted:
             connection.abort()
             return
         self.statistics.accepted += 1
-        self._unidentified[connection] = asyncio.get_running_loop().time()
+        self._unidentified.add(connection)
         task = asyncio.create_task(self._identify(connection), name="EWS-Box dials")
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
     def _on_gone(self, connection: Connection) -> None:
-        self._unidentified.pop(connection, None)
+        self._no_longer_unidentified(connection)
         self._cancel_timer(connection)
         known = self._identified.pop(connection, None)
         if known is None:
@@ -229,33 +280,49 @@ class Listener:
             return True
         return peer is not None and any(peer in network for network in self.allowed)
 
-    def _has_room(self) -> bool:
-        """Return whether one more may be identified; the oldest is dropped for it."""
-        if len(self._unidentified) < MOST_UNIDENTIFIED + len(self._registered):
+    def _no_longer_unidentified(self, connection: Connection) -> None:
+        self._unidentified.discard(connection)
+        self._admission.leave(connection)
+
+    def _may_receive(self, connection: Connection, count: int) -> bool:
+        """Return whether bytes of a connection may be looked at."""
+        now = asyncio.get_running_loop().time()
+        if self._admission.may_receive(connection, count, now):
             return True
-        oldest, since = next(iter(self._unidentified.items()))
-        if asyncio.get_running_loop().time() - since < GRACE:
-            return False
-        self.statistics.crowded_out += 1
-        oldest.abort()
-        return True
+        self.statistics.over_budget += 1
+        self._warn_of_crowd(now)
+        return False
+
+    def _warn_of_crowd(self, now: float) -> None:
+        if self._crowds.take(now):
+            _LOGGER.warning(
+                "Port %s: connections of devices that are no known box were ended; "
+                "there are too many, or they send too much",
+                self.port,
+            )
 
     async def _identify(self, connection: Connection) -> None:
         """Find out which box has dialled, and give the connection to its bus."""
         try:
             async with asyncio.timeout(IDENTIFY_TIME):
-                found = await _read_identity(connection)
+                found = await _read_identity(
+                    connection, partial(self._note_answer, connection)
+                )
         except (TimeoutError, EvseError) as error:
             _LOGGER.debug("A connection was not identified: %s", error)
             self.statistics.unidentified += 1
             connection.abort()
             return
-        self._unidentified.pop(connection, None)
+        self._no_longer_unidentified(connection)
         self._identified[connection] = found
         if (box := self._registered.get(found.serial)) is None:
             self._keep_unknown(found, connection)
         elif await self._may_replace(found, box, connection):
             self._bind(found.serial, box, connection)
+
+    def _note_answer(self, connection: Connection) -> None:
+        now = asyncio.get_running_loop().time()
+        self._admission.progressed(connection, now)
 
     def _keep_unknown(self, found: UnknownBox, connection: Connection) -> None:
         self.statistics.unknown += 1
@@ -280,6 +347,7 @@ class Listener:
             return
         self._warned.discard(serial)
         self._bound[serial] = connection
+        self._note_address(serial, box, connection.peer)
         box.line.attach(connection)
         box.bus.reschedule()
 
@@ -299,7 +367,7 @@ class Listener:
         try:
             await self._wait_for_proof_pause(serial)
             box.ports.poll_now()
-            answers = await line.answers(PROOF_TIME)
+            answers = await line.answers(_proof_time(box, connection))
         finally:
             self._proving.discard(serial)
         if answers:
@@ -327,10 +395,23 @@ class Listener:
         _LOGGER.warning(message, found.peer, bus.name)
 
 
-async def _read_identity(connection: Connection) -> UnknownBox:
-    """Read ``id`` and ``rs``; raises EvseError when the connection ends meanwhile."""
+def _proof_time(box: _RegisteredBox, connection: Connection) -> float:
+    """Return the time in which a connected box has to answer, s."""
+    if connection.peer is None or connection.peer != box.line.peer:
+        return PROOF_TIME
+    return min(box.bus.wire.round_trip.timeout + PROOF_MARGIN, PROOF_TIME)
+
+
+async def _read_identity(
+    connection: Connection, on_answered: Callable[[], None]
+) -> UnknownBox:
+    """Read ``id`` and ``rs``; raises EvseError when the connection ends meanwhile.
+
+    ``on_answered`` is called with each reply.
+    """
     framer = EwsFramer()
     line = AcceptedLine("unidentified", lambda: framer.noise)
+    line.on_answered = on_answered
     wire = Wire(line, framer, TCP_TIMING)
     line.on_lost = wire.fail
     infos: list[bytes] = []
