@@ -21,6 +21,9 @@ class ConnectorReading:
     charging: bool | None = None
     current: Phases[float | None] = UNKNOWN_PHASES
     """Used current, A."""
+    unconfirmed_current: Phases[float | None] = UNKNOWN_PHASES
+    """Used current by one more reply, which no other agrees with yet, A. It is not
+    shown, and counts in `drawn_at_most` until the next reply decides."""
     voltage: Phases[float | None] = UNKNOWN_PHASES
     cos_phi: Phases[float | None] = UNKNOWN_PHASES
     power: float | None = None
@@ -69,6 +72,33 @@ class ConnectorReading:
     """Highest level of the control pilot, V."""
     proximity_voltage: float | None = None
     """At the proximity contact of the cable, V."""
+
+    @property
+    def drawn_at_most(self) -> Phases[float | None]:
+        """Return the highest current of each phase that any reply has shown now, A.
+
+        For whatever must not be late: a guard of a fuse, a shared supply, the search
+        for a car that ignores its limit. `current` waits until a second reply agrees
+        with a change; this does not. ``None``: not measured.
+        """
+        one, two, three = (
+            _larger(shown, other)
+            for shown, other in zip(self.current, self.unconfirmed_current, strict=True)
+        )
+        return one, two, three
+
+    def exceeded_by(self, currents: Phases[float]) -> bool:
+        """Return whether currents (A) are above the highest known so far."""
+        return any(
+            known is None or current > known
+            for known, current in zip(self.drawn_at_most, currents, strict=True)
+        )
+
+
+def _larger(one: float | None, other: float | None) -> float | None:
+    if one is None or other is None:
+        return other if one is None else one
+    return max(one, other)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

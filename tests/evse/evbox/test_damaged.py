@@ -89,6 +89,94 @@ def test_a_current_above_the_order_is_shown_when_the_next_reply_agrees(
     run(act)
 
 
+def test_an_unconfirmed_current_counts_for_guards_at_once() -> None:
+    async def act(stage: Scene, damage: Damage) -> None:
+        (charger,) = stage.bus.chargers.values()
+        await asyncio.sleep(120.0)
+        seen: list[tuple[float | None, float | None]] = []
+
+        def look() -> None:
+            assert charger.reading is not None
+            one = charger.reading.connectors[1]
+            seen.append((one.current[0], one.drawn_at_most[0]))
+
+        charger.subscribe(look)
+        damage.changes = [{CURRENTS: "00C8" + "00C8" + "00C8"}]
+        await until(lambda: not damage.changes)
+        await asyncio.sleep(0.5)
+        # Within the limit of 25 A, and not shown.
+        assert seen[-1] == (8.0, 20.0)
+        await asyncio.sleep(3.0)
+        assert seen[-1] == (8.0, 8.0)
+
+    run(act)
+
+
+MODULE = slice(24, 28)
+VOLTAGES = slice(60, 72)
+ENERGY = slice(52, 60)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {CURRENTS: "00A000500050"},
+        {CURRENTS: "000000000000"},
+        {slice(40, 44): "03D4"},
+        {VOLTAGES: "00E600E600F6"},
+        {MODULE: "0064"},
+        {MAXIMUM: "0140"},
+        {ENERGY: "00002711"},
+    ],
+    ids=["current", "no current", "cos phi", "voltage", "minimum", "maximum", "meter"],
+)
+def test_one_damaged_reply_shows_no_value(change: dict[slice, str]) -> None:
+    """All of these are plausible: without another reply that agrees they count not."""
+
+    async def act(stage: Scene, damage: Damage) -> None:
+        (charger,) = stage.bus.chargers.values()
+        await asyncio.sleep(120.0)
+        shown = set()
+
+        def look() -> None:
+            assert charger.reading is not None
+            one = charger.reading.connectors[1]
+            shown.add(
+                (
+                    *(one.current, one.voltage, one.cos_phi, one.minimum_current),
+                    *(one.power, one.meter_generation, charger.reading.maximum_current),
+                )
+            )
+            truth = stage.line.points[0].modules[0].energy_wh
+            assert one.energy is not None
+            assert truth - 20 <= one.energy <= truth
+
+        charger.subscribe(look)
+        look()
+        for _ in range(3):
+            damage.changes = [change]
+            await until(lambda: not damage.changes)
+            await asyncio.sleep(15.0)
+        assert len(shown) == 1
+
+    run(act)
+
+
+def test_a_value_that_keeps_changing_is_shown_with_the_third_reply() -> None:
+    async def act(stage: Scene, damage: Damage) -> None:
+        (charger,) = stage.bus.chargers.values()
+        await asyncio.sleep(120.0)
+        damage.changes = [
+            {CURRENTS: current * 3} for current in ("0064", "00A0", "0078", "0050")
+        ]
+        await until(lambda: len(damage.changes) == 1)
+        await asyncio.sleep(0.5)
+        assert charger.reading is not None
+        assert charger.reading.connectors[1].current[0] == 12.0
+
+    run(act)
+
+
 def test_a_car_that_ignores_its_limit_is_shown_with_the_second_reading() -> None:
     async def act(stage: Scene, damage: Damage) -> None:
         (charger,) = stage.bus.chargers.values()

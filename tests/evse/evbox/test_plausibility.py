@@ -44,7 +44,7 @@ class Receiver(Plausibility):
 
 
 def steady() -> Receiver:
-    return Receiver(GOOD, GOOD)
+    return Receiver(GOOD, GOOD, GOOD)
 
 
 def with_module(**values: object) -> Reply:

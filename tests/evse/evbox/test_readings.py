@@ -15,7 +15,7 @@ from .replies import module, reply
 
 def connector(**values: object) -> ConnectorReading:
     one = reply(module(**values))  # type: ignore[arg-type]
-    accepted = AcceptedReply(reply=one, totals=(1000,), generations=(2,))
+    accepted = AcceptedReply(reply=one, is_shown=True, totals=(1000,), generations=(2,))
     return connectors(accepted, 240.0)[1]
 
 

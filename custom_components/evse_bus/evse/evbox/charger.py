@@ -365,19 +365,30 @@ class EvboxCharger(Charger[EvboxConfig]):
         self.notice(Fault.LIMIT_EXCEEDED, present=exceeded and not is_paused)
         self.notice(Fault.OVERCURRENT, present=accepted.over_current)
         self.notice(Fault.IMPLAUSIBLE, present=accepted.out_of_range)
-        if self._monitor.unconfirmed:
+        if self._monitor.unconfirmed or not accepted.is_shown:
             # It may be corrupt as a whole: shown only if the next reply agrees.
+            self._add_unconfirmed(reply)
             return
         serial = serial_number(reply) if self._serial is not None else None
         if self.info is None or self.info.serial != serial:
             self.info = charger_info(serial)
-        maximum = self._plausibility.maximum
         self.reading = ChargerReading(
             connectors=connectors(accepted, self.config.voltage),
-            maximum_current=maximum.value if maximum.confirmed else None,
+            maximum_current=self._plausibility.maximum.agreed,
             minimum_interval=reply.minimum_interval,
             details=self._details(reply),
         )
+
+    def _add_unconfirmed(self, reply: Reply) -> None:
+        """Let the currents of a reply that is not shown count for guards."""
+        if self.reading is None:
+            return
+        connectors = dict(self.reading.connectors)
+        for index, module in enumerate(reply.modules, 1):
+            shown = connectors.get(index)
+            if shown is not None and shown.exceeded_by(module.currents):
+                connectors[index] = replace(shown, unconfirmed_current=module.currents)
+        self.reading = replace(self.reading, connectors=connectors)
 
     def _details(self, reply: Reply) -> dict[str, str | int | float | bool | None]:
         confirmed = self._confirmed

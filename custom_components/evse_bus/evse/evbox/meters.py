@@ -8,7 +8,7 @@ module to another (PROTOCOLS.md section 1).
 
 from collections.abc import Sequence
 
-from ..meter import Meter, Total
+from ..meter import CONFIRMATIONS, Meter, Total
 
 type Totals = tuple[Total, ...]
 """The totals of all modules, by index."""
@@ -20,14 +20,16 @@ class Meters:
     def __init__(self) -> None:
         """Start without totals."""
         self._confirmed: Totals | None = None
-        self._unconfirmed: Totals | None = None
+        self._must_confirm = True
+        self._row: list[Totals] = []
+        """Consistent totals in a row, while they must be confirmed."""
         self._meters: list[Meter] = []
         """By index, those of modules that are gone included."""
 
     @property
     def unconfirmed(self) -> bool:
-        """Return whether the totals need a second reply that agrees."""
-        return self._unconfirmed is not None
+        """Return whether the totals need more replies that agree."""
+        return self._must_confirm
 
     def generation(self, index: int) -> int:
         """Return the generation of the meter at this index."""
@@ -36,10 +38,9 @@ class Meters:
         return self._meters[index].reading.generation
 
     def require_confirmation(self) -> None:
-        """Show no total until two replies agree: the ChargePoint was away."""
-        if self._confirmed is not None and self._unconfirmed is None:
-            # Totals of no module: none can grow from them, so two more are needed.
-            self._unconfirmed = ()
+        """Show no total until `CONFIRMATIONS` replies agree: it was away."""
+        self._must_confirm = True
+        self._row.clear()
 
     def jumps(self, totals: Totals, current: float) -> dict[int, float]:
         """Return the totals that do not continue the ones before, Wh, by index.
@@ -58,19 +59,17 @@ class Meters:
 
     def update(self, totals: Totals, current: float) -> Sequence[float | None]:
         """Accept the totals of a reply; return those that may be shown, Wh."""
-        known = self._confirmed if self._unconfirmed is None else self._unconfirmed
-        if known is None or len(known) != len(totals):
-            self._unconfirmed = totals
-            return [None] * len(totals)
-        if self._unconfirmed is not None:
-            agrees = all(
-                before.can_grow_to(total, current)
-                for before, total in zip(self._unconfirmed, totals, strict=True)
-            )
-            if not agrees:
-                self._unconfirmed = totals
+        before, row = self._confirmed, self._row
+        if before is not None and len(before) != len(totals):
+            self._must_confirm = True
+        if self._must_confirm:
+            if row and not _continue(row[-1], totals, current):
+                row.clear()
+            row.append(totals)
+            if len(row) < CONFIRMATIONS:
                 return [None] * len(totals)
-            self._unconfirmed = None
+            self._must_confirm = False
+            row.clear()
         self._take(totals, current)
         self._confirmed = totals
         return [total.energy for total in totals]
@@ -96,3 +95,10 @@ class Meters:
                 self._meters[index].take(total, current)
             else:
                 self._meters[index].renew(total)
+
+
+def _continue(before: Totals, after: Totals, current: float) -> bool:
+    return len(before) == len(after) and all(
+        one.can_grow_to(other, current)
+        for one, other in zip(before, after, strict=True)
+    )

@@ -1,4 +1,10 @@
-"""Plausibility of replies: an implausible one is quarantined until it is confirmed.
+"""Plausibility of replies: which of their values count, and which are shown.
+
+A reply is shown when it agrees with the one before, or with the one shown last: two
+corrupt frames in a row never agree. Of replies that keep changing the third in a row
+is shown, and after an absence the first: the next may be 20 s away, and meters, maximum
+and serial number wait for it all the same. What must not wait counts at once
+(`Plausibility.accept`).
 
 Corrupt frames can pass both checksums (PROTOCOLS.md section 1), so the values of each
 decoded reply are checked. An implausible reply is quarantined and changes nothing.
@@ -12,13 +18,13 @@ while a box runs (maximum, interval, minimum), close where it is measured, and g
 no faster than possible where it is a meter total.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
 
 from ..errors import ImplausibleReplyError
-from ..meter import CONFIRMATIONS, Total
+from ..meter import CONFIRMATIONS, HIGHEST_PHASE_VOLTAGE, Total
 from ..model import MAXIMUM_CURRENT, MINIMUM_CURRENT, Phases
 from ..plausibility import (
     CURRENT_AGREEMENT,
@@ -58,6 +64,17 @@ _AGREEMENT: Final[Mapping[Quantity, Agreement]] = {
     Quantity.COS_PHI: (0.1, 0.05),
     Quantity.VOLTAGE: (0.1, 5.0),
 }
+
+_STEADY: Final[Mapping[Quantity, float]] = {
+    # Largest difference of the same value in two replies that agree.
+    Quantity.CURRENT: 0.5,
+    Quantity.COS_PHI: 0.05,
+    Quantity.VOLTAGE: 5.0,
+}
+_METER_FACTOR: Final = 1.25
+_METER_STEP: Final = 2.0
+"""A meter may be ahead of the power in both replies by this share and amount, Wh."""
+_SECONDS_PER_HOUR: Final = 3600.0
 
 type Place = tuple[Quantity, int | None, int | None]
 """A quantity, its module and its phase, counted from 0; ``None``: of all."""
@@ -117,15 +134,12 @@ class ConfirmedValue:
         self.value = start
         self.reported: float | None = None
         """The value in the last reply."""
-        self.confirmed = False
-        """Two replies have reported one."""
         self.agreed: float | None = None
         """The last value that two replies in a row agreed on."""
         self._before = start
 
     def update(self, reported: float) -> None:
         """Take the value of a reply."""
-        self.confirmed = self.reported is not None
         if reported == self.reported:
             self.agreed = reported
         self.value = min(self._before, reported)
@@ -145,6 +159,9 @@ def new_interval() -> ConfirmedValue:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AcceptedReply:
     """A reply that is plausible, or confirmed by others."""
+
+    is_shown: bool
+    """Another reply agrees with it."""
 
     reply: Reply
     totals: tuple[float | None, ...]
@@ -190,6 +207,10 @@ class Plausibility:
         self._quarantine: list[_Checked] = []
         self._accepted: _Checked | None = None
         """The last reply, if it was accepted although it was implausible."""
+        self._shown: _Checked | None = None
+        """The last reply that was shown."""
+        self._waiting: list[_Checked] = []
+        """Accepted replies since then, which no other agrees with."""
 
     @property
     def quarantined(self) -> int:
@@ -201,6 +222,7 @@ class Plausibility:
         """Return whether another reply is needed soon to confirm a value."""
         return bool(
             self._quarantine
+            or self._waiting
             or self.maximum.rising
             or self.minimum.rising
             or self.interval.rising
@@ -217,11 +239,13 @@ class Plausibility:
         self.minimum = ConfirmedValue(MINIMUM_CURRENT)
         self.meters.require_confirmation()
         self._quarantine.clear()
-        self._accepted = None
+        self._accepted = self._shown = None
+        self._waiting.clear()
 
     def accept(self, reply: Reply, now: float) -> AcceptedReply:
         """Accept a reply received at this time (s).
 
+        Its maximum, minimum and interval count from now on, as far as they are lower.
         Raises ImplausibleReplyError for one that is quarantined: no value changes.
         """
         highest = self._highest_current(reply)
@@ -236,7 +260,8 @@ class Plausibility:
             raise ImplausibleReplyError(message)
         self._quarantine.clear()
         self._accepted = checked if implausible else None
-        return self._update(checked, highest)
+        self._update(checked.reply)
+        return self._show(checked, highest)
 
     def _highest_current(self, reply: Reply) -> float:
         """Return the highest used current of a phase that is plausible, A.
@@ -261,8 +286,39 @@ class Plausibility:
         self._quarantine.append(checked)
         return len(self._quarantine) >= CONFIRMATIONS
 
-    def _update(self, checked: _Checked, highest: float) -> AcceptedReply:
-        reply = checked.reply
+    def _show(self, checked: _Checked, highest: float) -> AcceptedReply:
+        """Show a reply if another agrees with it; its meters count only then."""
+        waiting = self._waiting
+        confirmed = [
+            one
+            for one in (self._shown, *waiting[-1:])
+            if one is not None and _is_steady(one, checked)
+        ]
+        is_shown = (
+            self._shown is None
+            or bool(confirmed or checked.implausible)
+            or len(waiting) + 1 >= CONFIRMATIONS
+        )
+        count = len(checked.totals)
+        totals: Sequence[float | None] = [None] * count
+        if is_shown:
+            for one in waiting[-1:]:
+                if one in confirmed:
+                    self.meters.update(one.totals, highest)
+            totals = self.meters.update(checked.totals, highest)
+            self._shown = checked
+            waiting.clear()
+        else:
+            waiting.append(checked)
+        return AcceptedReply(
+            reply=checked.reply,
+            is_shown=is_shown,
+            totals=tuple(totals),
+            generations=tuple(map(self.meters.generation, range(count))),
+            implausible=checked.implausible,
+        )
+
+    def _update(self, reply: Reply) -> None:
         self.maximum.update(reply.maximum_current)
         self.interval.update(reply.minimum_interval)
         smallest = min(
@@ -270,13 +326,54 @@ class Plausibility:
             default=MINIMUM_CURRENT,
         )
         self.minimum.update(max(smallest, MINIMUM_CURRENT))
-        shown = tuple(self.meters.update(checked.totals, highest))
-        return AcceptedReply(
-            reply=reply,
-            totals=shown,
-            generations=tuple(map(self.meters.generation, range(len(shown)))),
-            implausible=checked.implausible,
+
+
+def _is_steady(before: _Checked, after: _Checked) -> bool:
+    """Return whether two replies agree in all their values."""
+    one, two = before.reply, after.reply
+    return (
+        (one.serial, one.minimum_interval, one.maximum_current)
+        == (two.serial, two.minimum_interval, two.maximum_current)
+        and len(one.modules) == len(two.modules)
+        and all(
+            _is_steady_module(first, second)
+            for first, second in zip(one.modules, two.modules, strict=True)
         )
+        and all(
+            0 <= later.energy - total.energy <= _growth(first, second, later, total)
+            for first, second, total, later in zip(
+                one.modules, two.modules, before.totals, after.totals, strict=True
+            )
+        )
+    )
+
+
+def _is_steady_module(one: ModuleReply, two: ModuleReply) -> bool:
+    pairs = {
+        Quantity.CURRENT: zip(one.currents, two.currents, strict=True),
+        Quantity.COS_PHI: zip(one.cos_phi, two.cos_phi, strict=True),
+        Quantity.VOLTAGE: zip(one.voltages or (), two.voltages or (), strict=True),
+    }
+    return one.minimum_current == two.minimum_current and all(
+        abs(first - second) <= _STEADY[quantity]
+        for quantity, values in pairs.items()
+        for first, second in values
+    )
+
+
+def _growth(one: ModuleReply, two: ModuleReply, later: Total, total: Total) -> float:
+    """Return what a meter may have counted between two replies, Wh."""
+    power = max(_most_power(one), _most_power(two))
+    passed = later.at - total.at
+    return _METER_STEP + _METER_FACTOR * power * passed / _SECONDS_PER_HOUR
+
+
+def _most_power(module: ModuleReply) -> float:
+    voltages = module.voltages or (HIGHEST_PHASE_VOLTAGE,) * 3
+    return sum(
+        current * (voltage or HIGHEST_PHASE_VOLTAGE)
+        for current, voltage in zip(module.currents, voltages, strict=True)
+    )
 
 
 def _consistent(first: _Checked, second: _Checked, highest: float) -> bool:
