@@ -124,6 +124,22 @@ def test_worst_cases_follow() -> None:
     simulate(scene())
 
 
+@pytest.mark.parametrize("trip", [0.5, 1.0, 2.0])
+def test_a_slow_line_with_a_dead_charger_is_learnt(trip: float) -> None:
+    """The reply came after the request to the other one, and counted as foreign."""
+
+    async def scene() -> None:
+        bus = Scene(addresses=(1, 2), interval=1.0)
+        bus.line.devices[1].delay = trip
+        bus.line.devices[2].alive = False
+        async with bus:
+            await asyncio.sleep(30)
+            assert bus.charger(1).available
+            assert bus.bus.wire.statistics.late
+
+    simulate(scene())
+
+
 TRIPS = Timing(reply_timeout=0.3, longest_reply=40)
 
 

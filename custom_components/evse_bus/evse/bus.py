@@ -28,14 +28,12 @@ from .listeners import Observable
 from .master import BusMaster, ChargerGroup
 from .model import OrderChange, Persistence
 from .port import Port
-from .schedule import Kind, Slot, choose
+from .schedule import Kind, Slot, Turns, choose
 from .throttle import RateLimiter
 from .timer import WakeTimer
 
 _LOGGER = logging.getLogger(__name__)
 
-COMMAND_PATIENCE: Final = 120.0
-"""Longest time until a command begins, s; longer than any minimum interval."""
 STOP_PATIENCE: Final = 6.0
 """Longest time a stop waits for a conversation begun (waking a car: 3 s), s."""
 FAILURE_PAUSE: Final = 1.0
@@ -66,7 +64,7 @@ class Bus(Observable):
         self.line = line
         self.wire = Wire(line, framer, timing)
         self.wire.on_unsolicited = self._on_unsolicited
-        self.wire.on_timeout_changed = self._update_worst_cases
+        self.wire.on_times_changed = self._update_times
         self.chargers: dict[str, Charger] = {}
         self.group = group
         self.master = group if isinstance(group, BusMaster) else None
@@ -80,7 +78,7 @@ class Bus(Observable):
         self.port.on_lost = self._on_lost
         self._turn_of: Slot | None = None
         self._turn_over = asyncio.Event()
-        self._last_probe = -inf
+        self._last = Turns()
         self._failures = RateLimiter(FAILURES_LOGGED, FAILURES_WINDOW)
         if group is not None:
             group.bus = self
@@ -150,7 +148,7 @@ class Bus(Observable):
         self.chargers[charger.config.key] = charger
         if self.group is not None:
             self.group.added(charger)
-        charger.slot.worst_case = self.worst_case(charger)
+        self._set_times(charger)
         charger.resume(self.line.memory)
         if self.connected:
             self._respect_minimum(charger)
@@ -237,9 +235,15 @@ class Bus(Observable):
         """Choose the next turn anew: something has changed."""
         self._timer.wake()
 
-    def _update_worst_cases(self) -> None:
+    def _set_times(self, charger: Charger) -> None:
+        charger.slot.worst_case = self.worst_case(charger)
+        usual = self.wire.usual_time(charger.longest_request)
+        if usual is not None:
+            charger.slot.usual = charger.exchanges_per_turn * usual
+
+    def _update_times(self) -> None:
         for charger in self.chargers.values():
-            charger.slot.worst_case = self.worst_case(charger)
+            self._set_times(charger)
         for job in self._jobs:
             owner = self._charger_of(job)
             if owner is not None and job.change is not None:
@@ -261,17 +265,18 @@ class Bus(Observable):
                     await self.port.renew()
                 if not self.line.is_open and not await self.port.reopen():
                     return
-                self._jobs.fail_older(self.now - COMMAND_PATIENCE)
                 slots = self._slots()
                 if self._stopping and not slots:
                     return
-                choice = choose(slots, self.now, self._last_probe)
+                choice = choose(slots, self.now, self._last)
                 slot = choice.slot
                 if slot is None:
                     wake_at = min(choice.wake_at, self.port.renew_at)
                     await self._timer.sleep_until(wake_at)
                     continue
                 self.wire.statistics.for_deadline += choice.for_deadline
+                if choice.is_extra:
+                    self._last.extra = self.now
                 await self._serve(slot)
             except Exception:
                 # Without this task all chargers of the bus would fall silent.
@@ -315,7 +320,10 @@ class Bus(Observable):
             await self._master_turn(self.master, now)
             return
         if slot.kind is Kind.PROBE:
-            self._last_probe = now
+            self._last.probe = now
+        slot.turn_at = now
+        if slot.meets is not None:
+            slot.meets.turn_at = now
         charger = self._charger_of(slot)
         if charger is not None and now > charger.slot.start_by:
             charger.statistics.missed_deadlines += 1
@@ -338,7 +346,7 @@ class Bus(Observable):
         late = now > master.slot.start_by
         master.statistics.missed_deadlines += late
         self.wire.statistics.missed_deadlines += late
-        master.slot.served = now
+        master.slot.served = master.slot.turn_at = now
         try:
             await master.turn(Turn(self.wire, master.statistics))
         except EvseError as error:

@@ -56,8 +56,8 @@ class Wire:
         self.frames = FrameLog()
         self.recovery = LineRecovery()
         self.round_trip = RoundTrip(timing)
-        self.on_timeout_changed: Callable[[], None] = lambda: None
-        """Called when the reply time-out has changed, and with it all worst cases."""
+        self.on_times_changed: Callable[[], None] = lambda: None
+        """Called when exchanges take another time than before, usually or at worst."""
         self.on_unsolicited: Callable[[Frame], bool] = lambda _frame: False
         """Called with a good frame that is no reply; returns whether it was used."""
         self.sent_at: float | None = None
@@ -65,7 +65,8 @@ class Wire:
         self._framer = framer
         self._received_at = -inf
         self._pending: _PendingReply | None = None
-        self._unanswered: _Unanswered | None = None
+        self._unanswered: list[_Unanswered] = []
+        """Requests whose replies may still come, oldest first."""
         line.on_data = self._on_data
 
     def exchange_time(self, request_bytes: int = _BASE_REQUEST) -> float:
@@ -77,6 +78,13 @@ class Wire:
         trip = self.round_trip
         return silence + wire + trip.timeout + trip.drain + timing.gap
 
+    def usual_time(self, request_bytes: int = _BASE_REQUEST) -> float | None:
+        """Return the time an exchange usually takes, s; ``None``: no reply yet."""
+        if (trip := self.round_trip.usual) is None:
+            return None
+        request = request_bytes * self.line.settings.byte_time
+        return self.timing.silence + request + trip
+
     def send_time(self, request_bytes: int) -> float:
         """Return the longest time that sending without a reply can take, s."""
         silence = self.timing.silence_patience if self.timing.silence else 0.0
@@ -85,7 +93,7 @@ class Wire:
     def reset(self) -> None:
         """Drop an incomplete frame: the line was opened anew."""
         self._framer.reset()
-        self._unanswered = None
+        self._unanswered.clear()
         self.recovery.opened()
 
     def fail(self, error: LineLostError) -> None:
@@ -104,7 +112,7 @@ class Wire:
     ) -> T:
         """Send a request and wait for its reply (see `Turn.exchange`)."""
         self.sent_at = None
-        is_repeat = await self._drain()
+        await self._drain()
         await self._silence()
         data = request() if callable(request) else request
         loop = asyncio.get_running_loop()
@@ -130,7 +138,7 @@ class Wire:
             counted.timeouts += 1
             if self._received_at < started:
                 self.recovery.unanswered(loop.time())
-            self._unanswered = _Unanswered(accept, sent, loop.time())
+            self._unanswered.append(_Unanswered(accept, sent, loop.time()))
             self._framer.reset()
             if self._is_disturbed(bad, noise, counted):
                 message = "a reply came, but it could not be read"
@@ -143,7 +151,7 @@ class Wire:
                 self.line.answered()
                 self.statistics.replies += 1
                 counted.reply(pending.answered_at - started)
-                if not is_repeat and not patience:
+                if not patience and self._late_request(pending.frame) is None:
                     self._measure(pending.answered_at - sent)
         if not self.line.is_open:
             # Lost together with the reply: the conversation must not go on.
@@ -177,37 +185,38 @@ class Wire:
         await asyncio.sleep(sent - asyncio.get_running_loop().time())
         return sent
 
-    async def _drain(self) -> bool:
-        """Wait for the late reply to a request that has timed out, on a slow line.
-
-        Returns whether one may still come: then the next reply may be that one, and
-        its round trip is not measured.
-        """
-        unanswered, loop = self._unanswered, asyncio.get_running_loop()
-        if unanswered is None:
-            return False
-        wait = unanswered.timed_out_at + self.round_trip.drain - loop.time()
+    async def _drain(self) -> None:
+        """Wait for the late reply to a request that has timed out, on a slow line."""
+        if not self._unanswered:
+            return
+        loop = asyncio.get_running_loop()
+        last = self._unanswered[-1]
+        wait = last.timed_out_at + self.round_trip.drain - loop.time()
         if wait > 0:
             await asyncio.sleep(wait)
-        if loop.time() - unanswered.sent_at > self.round_trip.longest:
-            self._unanswered = None
-        return self._unanswered is not None
+        since = loop.time() - self.round_trip.longest
+        self._unanswered = [one for one in self._unanswered if one.sent_at >= since]
+
+    def _late_request(self, frame: Frame | None) -> _Unanswered | None:
+        """Return the oldest request that has timed out and has this reply, if any.
+
+        So a reply that may be that of an earlier request is not measured.
+        """
+        return next((one for one in self._unanswered if one.accepts(frame)), None)
 
     def _measure(self, round_trip: float) -> None:
-        before = self.round_trip.timeout
-        self.round_trip.measure(round_trip)
-        if self.round_trip.timeout != before:
-            self.on_timeout_changed()
+        if self.round_trip.measure(round_trip):
+            self.on_times_changed()
 
     def _is_late(self, frame: Frame) -> bool:
-        """Return whether a frame is the late reply; its contents are not used."""
-        unanswered = self._unanswered
-        if unanswered is None or not unanswered.accepts(frame):
+        """Return whether a frame is a late reply; its contents are not used."""
+        request = self._late_request(frame)
+        if request is None:
             return False
-        self._unanswered = None
+        self._unanswered.remove(request)
         self.statistics.late += 1
         now = asyncio.get_running_loop().time()
-        self._measure(now - unanswered.sent_at)
+        self._measure(now - request.sent_at)
         return True
 
     async def _silence(self) -> None:
@@ -342,7 +351,7 @@ class _Unanswered:
     sent_at: float
     timed_out_at: float
 
-    def accepts(self, frame: Frame) -> bool:
+    def accepts(self, frame: Frame | None) -> bool:
         """Return whether a frame is its reply, a refusal included."""
         try:
             return self.accept(frame) is not None
@@ -364,6 +373,8 @@ class _PendingReply:
         self._loop = asyncio.get_running_loop()
         self.future: asyncio.Future[object] = self._loop.create_future()
         self.answered_at: float | None = None
+        self.frame: Frame | None = None
+        """Its reply."""
         self._accept = accept
         self._gap = gap
         self._first_byte_by = first_byte_by
@@ -387,6 +398,7 @@ class _PendingReply:
                 self.future.set_result(result)
         if self.answered_at is None:
             self.answered_at = self._loop.time()
+            self.frame = frame
         return True
 
     def extend(self) -> None:

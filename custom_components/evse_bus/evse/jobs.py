@@ -153,16 +153,6 @@ class JobQueue:
             if not job.under_way and (begun or not job.begun):
                 self.fail(job, error)
 
-    def fail_older(self, due: float) -> None:
-        """End jobs that should have begun before this loop time, and have not.
-
-        Where the deadlines of a bus leave no room for the worst case of a command, it
-        would wait for ever.
-        """
-        for job in self:
-            if job.due < due and not (job.begun or job.under_way or job.running):
-                self.fail(job, LineBusyError("the bus has no time for it"))
-
     def _remove(self, job: Job) -> None:
         if job in self._jobs:
             self._jobs.remove(job)

@@ -12,6 +12,9 @@ _DEVIATION_WEIGHT = 1 / 4
 _DEVIATIONS = 4
 _MARGIN = 1.5
 """The time-out is at least so many mean round trips."""
+_USUAL_DEVIATIONS = 2
+_NOTABLE = 1.1
+"""A usual round trip that differs by this factor is worth to be followed."""
 _SLOW = 1 / 4
 """A line is slow when its mean round trip is more than this part of the protocol's own
 time-out."""
@@ -28,11 +31,19 @@ class RoundTrip:
         self._deviation = 0.0
         self.timeout = timing.reply_timeout
         """The reply time-out of this line now, s."""
+        self._followed = 0.0
 
     @property
     def mean(self) -> float | None:
         """Return the mean round trip, s; ``None``: no reply yet."""
         return self._mean
+
+    @property
+    def usual(self) -> float | None:
+        """Return a round trip that few exceed, s; ``None``: no reply yet."""
+        if self._mean is None:
+            return None
+        return min(self._mean + _USUAL_DEVIATIONS * self._deviation, self.timeout)
 
     @property
     def longest(self) -> float:
@@ -50,11 +61,13 @@ class RoundTrip:
             return 0.0
         return min(self._mean, self._most)
 
-    def measure(self, round_trip: float) -> None:
+    def measure(self, round_trip: float) -> bool:
         """Take note of a round trip, s, of a reply that belongs to its request.
 
-        One that is longer than the time-out counts at once, alone.
+        One that is longer than the time-out counts at once, alone. Returns whether
+        times have changed that others depend on.
         """
+        timeout = self.timeout
         if self._mean is None or round_trip > self.timeout:
             self._mean, self._deviation = round_trip, round_trip / 4
         else:
@@ -63,3 +76,8 @@ class RoundTrip:
             self._mean += _WEIGHT * (round_trip - self._mean)
         wanted = max(_MARGIN * self._mean, self._mean + _DEVIATIONS * self._deviation)
         self.timeout = min(max(wanted, self._least), self._most)
+        usual = self.usual or 0.0
+        followed = self._followed / _NOTABLE <= usual <= self._followed * _NOTABLE
+        if not followed:
+            self._followed = usual
+        return self.timeout != timeout or not followed

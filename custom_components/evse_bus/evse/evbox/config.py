@@ -23,6 +23,8 @@ TIMING: Final = Timing(
     silence_patience=2.0,
     # The box waits for 100 ms of silence too, longer if other stations send.
     reply_timeout=1.0,
+    # A third of the shortest time-out that the usual poll interval allows.
+    reply_timeout_limit=5.0,
     gap=0.1,
     longest_reply=LONGEST_FRAME,
     # The minimum interval of the box makes these longer where it is longer.
