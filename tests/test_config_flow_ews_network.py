@@ -14,6 +14,7 @@ from tests.common import bus_entry, free_port, wait_until
 from tests.flow import Flow, ews_step, fields
 from tests.listening import (
     HOST,
+    OTHER,
     SERIAL,
     dialling,
     listener_of,
@@ -303,6 +304,8 @@ async def test_restricting_ends_connections_and_reloads_nothing(
                 "2001:db8::/32",
             ]
             await flow.submit({"allowed": typed})
+            assert flow.step == "excludes"
+            await flow.choose("save")
             assert flow.result["type"] is FlowResultType.CREATE_ENTRY
             networks = ["192.0.2.0/24", "198.51.100.7", "2001:db8::/32"]
             assert entry.options == {"allowed": networks}
@@ -326,6 +329,38 @@ async def test_restricting_ends_connections_and_reloads_nothing(
             assert running.connections.connected == 1
         assert entry.runtime_data is running
         assert listener_of(entry) is listener
+
+
+async def test_networks_that_exclude_a_known_box_are_confirmed(
+    hass: HomeAssistant,
+) -> None:
+    """A typing error would end the charge of every car."""
+    yard, never = stored_box(SERIAL), {**stored_box(OTHER), "title": "Shed"}
+    async with listening(hass, yard, never) as entry:
+        running = entry.runtime_data
+        with dialling(entry) as dialler:
+            await wait_until(hass, lambda: running.connections.connected == 1)
+            typed = {"allowed": ["192.0.2.0/24"]}
+            flow = await Flow.change_options(hass, entry)
+            await flow.submit(typed)
+            assert flow.step == "excludes"
+            assert flow.tells("- Yard (127.0.0.1)")
+            assert not flow.tells("Shed")
+            assert running.connections.connected == 1
+            await flow.choose("init")
+            assert fields(flow) == typed
+            # With its address, also in a network, nothing is asked.
+            await flow.submit({"allowed": ["192.0.2.0/24", "127.0.0.0/8"]})
+            assert flow.result["type"] is FlowResultType.CREATE_ENTRY
+
+            # It counts where it was, when it is away.
+            dialler.hang_up(redial=False)
+            await wait_until(hass, lambda: running.connections.connected == 0)
+            flow = await Flow.change_options(hass, entry)
+            await flow.submit(typed)
+            assert flow.tells("- Yard (127.0.0.1)")
+            await flow.choose("save")
+            assert entry.options == typed
 
 
 async def test_on_a_serial_line_there_is_nobody_to_restrict(

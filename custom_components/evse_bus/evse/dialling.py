@@ -75,9 +75,11 @@ class Listener(Protocol):
     def allow(self, networks: Iterable[Network]) -> None:
         """Let only these networks connect; none: all may."""
 
-    @property
-    def addresses(self) -> Mapping[str, Address]:
-        """Return the last addresses of registered boxes, by serial number."""
+    def excluded_by(self, networks: Iterable[Network]) -> Mapping[str, Address]:
+        """Return the registered boxes, by serial number, that these would keep out.
+
+        With the address from which each dialled last.
+        """
 
     def register(
         self, serial: str, name: str = "", addresses: Iterable[Address] = ()

@@ -35,10 +35,11 @@ from homeassistant.helpers.selector import (
 import probatio as vol
 
 from ..configuration import protocol_of
-from ..connections import address_name
+from ..connections import ListenerConnections, address_name
 from ..const import (
     CONF_ALLOWED,
     CONF_PROTOCOL,
+    CONF_SERIAL,
     DOMAIN,
     LOGGER,
     SUBENTRY_CHARGER,
@@ -359,18 +360,22 @@ def listener_title(protocol: Protocol, data: Mapping[str, Any]) -> str:
 class ListenerOptionsFlow(OptionsFlow):
     """Options of a listener: the addresses from which boxes may dial."""
 
+    _typed: Mapping[str, Any] | None = None
+    _allowed: tuple[str, ...] = ()
+    """What was typed, without duplicates."""
+
     async def async_step_init(
         self, user_input: dict[str, Any] | None = None
     ) -> ConfigFlowResult:
         """Ask for addresses and networks; none: any address is allowed."""
         wrong = ""
         if user_input is not None:
+            self._typed = user_input
             typed = [text.strip() for text in user_input.get(CONF_ALLOWED, ())]
             wrong = next((text for text in typed if text and not _network(text)), "")
             if not wrong:
-                # Without duplicates, in the order typed.
-                allowed = dict.fromkeys(filter(None, map(_network, typed)))
-                return self.async_create_entry(data={CONF_ALLOWED: list(allowed)})
+                self._allowed = tuple(dict.fromkeys(filter(None, map(_network, typed))))
+                return await self.async_step_excludes()
         form = vol.Schema(
             {
                 vol.Optional(CONF_ALLOWED): TextSelector(
@@ -378,14 +383,45 @@ class ListenerOptionsFlow(OptionsFlow):
                 )
             }
         )
+        suggested = self.config_entry.options if self._typed is None else self._typed
         return self.async_show_form(
             step_id="init",
-            data_schema=self.add_suggested_values_to_schema(
-                form, self.config_entry.options if user_input is None else user_input
-            ),
+            data_schema=self.add_suggested_values_to_schema(form, suggested),
             errors={CONF_ALLOWED: "bad_network"} if wrong else {},
             description_placeholders={"network": wrong},
         )
+
+    async def async_step_excludes(self) -> ConfigFlowResult:
+        """Warn of boxes that could no longer connect."""
+        if not (excluded := self._excluded()):
+            return await self.async_step_save()
+        return self.async_show_menu(
+            step_id="excludes",
+            menu_options=["init", "save"],
+            description_placeholders={"boxes": "\n".join(excluded)},
+        )
+
+    def _excluded(self) -> list[str]:
+        """Return the boxes whose last address would not be allowed, as a list."""
+        entry: EvseBusConfigEntry = self.config_entry
+        if entry.state is not ConfigEntryState.LOADED:
+            return []
+        connections = entry.runtime_data.connections
+        if not isinstance(connections, ListenerConnections):
+            return []
+        excluded = connections.listener.excluded_by(map(ip_network, self._allowed))
+        return [
+            f"- {subentry.title} ({excluded[serial]})"
+            for subentry in entry.get_subentries_of_type(SUBENTRY_CHARGER)
+            if (serial := subentry.data[CONF_SERIAL]) in excluded
+        ]
+
+    async def async_step_save(
+        self,
+        user_input: dict[str, Any] | None = None,  # noqa: ARG002 - a menu has none
+    ) -> ConfigFlowResult:
+        """Allow these addresses and networks only."""
+        return self.async_create_entry(data={CONF_ALLOWED: list(self._allowed)})
 
 
 def _network(text: str) -> str | None:

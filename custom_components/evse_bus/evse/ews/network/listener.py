@@ -8,7 +8,7 @@ Addresses of registered boxes are remembered: places are kept for them (`admissi
 """
 
 import asyncio
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 import errno
@@ -167,7 +167,7 @@ class Listener:
         """
         self.allowed = tuple(map(_plain, networks))
         for connection in (*self._unidentified, *self._identified):
-            if not self._is_allowed(connection.peer):
+            if not _is_allowed(connection.peer, self.allowed):
                 self.statistics.not_allowed += 1
                 connection.abort()
 
@@ -206,16 +206,21 @@ class Listener:
             self._keep_places()
             await box.bus.stop()
 
-    @property
-    def addresses(self) -> Mapping[str, Address]:
-        """Return the addresses of registered boxes, by serial number.
+    def excluded_by(self, networks: Iterable[Network]) -> Mapping[str, Address]:
+        """Return the registered boxes that could not connect if only these may.
 
-        That of a box that is not connected is the last one known.
+        By serial number, with the address; that of a box that is not connected is the
+        last one known.
         """
-        return {
-            serial: box.line.peer or box.addresses[0]
+        allowed = tuple(map(_plain, networks))
+        last = {
+            serial: box.line.peer or next(iter(box.addresses), None)
             for serial, box in self._registered.items()
-            if box.line.peer or box.addresses
+        }
+        return {
+            serial: address
+            for serial, address in last.items()
+            if address is not None and not _is_allowed(address, allowed)
         }
 
     def _keep_places(self) -> None:
@@ -241,7 +246,7 @@ class Listener:
     # -- Connections -----------------------------------------------------------------
 
     def _on_connection(self, connection: Connection) -> None:
-        if self._server is None or not self._is_allowed(connection.peer):
+        if self._server is None or not _is_allowed(connection.peer, self.allowed):
             self.statistics.not_allowed += 1
             connection.abort()
             return
@@ -274,11 +279,6 @@ class Listener:
     def _cancel_timer(self, connection: Connection) -> None:
         if (timer := self._timers.pop(connection, None)) is not None:
             timer.cancel()
-
-    def _is_allowed(self, peer: Address | None) -> bool:
-        if not self.allowed:
-            return True
-        return peer is not None and any(peer in network for network in self.allowed)
 
     def _no_longer_unidentified(self, connection: Connection) -> None:
         self._unidentified.discard(connection)
@@ -435,6 +435,13 @@ async def _read_identity(
     return UnknownBox(
         serial=status.serial, info=charger_info(status), peer=connection.peer
     )
+
+
+def _is_allowed(peer: Address | None, allowed: Collection[Network]) -> bool:
+    """Return whether an address may connect; ``allowed``: none: all may."""
+    if not allowed:
+        return True
+    return peer is not None and any(peer in network for network in allowed)
 
 
 def _plain(network: Network) -> Network:
