@@ -66,6 +66,8 @@ class Outcome:
     """Time of each confirmed command, s."""
     failed: Counter[str] = field(default_factory=Counter)
     """Commands that failed, by error."""
+    notes: list[str] = field(default_factory=list)
+    """What failed, in words."""
     shared: int | None = None
     """Times at which a shared supply was exceeded."""
     longest_shared: float = 0.0
@@ -95,9 +97,9 @@ async def run(*, quick: bool) -> list[Figure]:
     figures: list[Figure] = []
     for case, outcome in zip(cases, outcomes, strict=True):
         figures += case_figures(case.name, outcome)
-        for found in outcome.findings:
-            for note in found.notes:
-                report(f"{case.name}: {note}")
+        found = [note for one in outcome.findings for note in one.notes]
+        for note in (*found, *outcome.notes):
+            report(f"{case.name}: {note}")
     return figures
 
 
@@ -146,6 +148,9 @@ async def _order(chargers: list[Charger], dice: Random, outcome: Outcome) -> Non
             await charger.change_orders(change)
         except EvseError as error:
             outcome.failed[type(error).__name__] += 1
+            outcome.notes.append(
+                f"[{loop.time():.2f} s, {charger.config.name}] {change} failed: {error}"
+            )
         else:
             outcome.commands.append(loop.time() - began)
 
