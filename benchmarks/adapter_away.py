@@ -27,6 +27,8 @@ BETWEEN: Final = (5.0, 60.0)
 """Time between two absences, s."""
 AIM: Final = 10.0
 """s"""
+HALF_OPEN_AIM: Final = SILENCES[0] + AIM + 8.0
+"""s; 8 s: up to so long until the first request that is not answered."""
 _LOOK: Final = 0.02
 _GIVES_UP: Final = 900.0
 
@@ -144,7 +146,6 @@ async def _back(scene: Scene, before: int = 0) -> float:
 def case_figures(name: str, outcome: Outcome) -> list[Figure]:
     """Return the figures of one scene."""
     note = f"{len(outcome.opened)} absences"
-    silence = SILENCES[0]
     return [
         _seconds(f"{name}: until open, longest", max(outcome.opened), AIM, note),
         _seconds(f"{name}: until read, p99", percentile(outcome.read, 0.99)),
@@ -152,7 +153,7 @@ def case_figures(name: str, outcome: Outcome) -> list[Figure]:
         _seconds(
             f"{name}: half-open until read, longest",
             max(outcome.half_open),
-            silence + AIM,
+            HALF_OPEN_AIM,
             f"{len(outcome.half_open)} times",
         ),
     ]

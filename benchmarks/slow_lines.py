@@ -29,6 +29,8 @@ DELAYS: Final = ((0.0, 0.0), (0.05, 0.0), (0.16, 0.0), (0.4, 0.0), (0.16, 0.3))
 """Delay each way, and up to how much more for each piece, s."""
 BETWEEN_ORDERS: Final = (20.0, 60.0)
 CURRENTS: Final = (6.0, 8.0, 10.0, 12.5, 14.0, 16.0)
+QUIET: Final = 1.5
+"""No request is under way after so much silence, s; less than a poll interval."""
 _PATIENCE: Final = 60.0
 
 METHOD = """\
@@ -171,6 +173,9 @@ async def watch(case: Case) -> Outcome:
         adapter = scene.virtual.adapter
         adapter.delay_out = adapter.delay_in = case.delay
         adapter.jitter = case.jitter
+        if scene.dials:
+            # Requests before it is identified are not those of its bus.
+            await _settled(scene)
         late = LateReplies(adapter, scene.bus)
         # What the library must learn about a slow line first is not counted.
         await asyncio.sleep(_PATIENCE)
@@ -189,6 +194,17 @@ async def watch(case: Case) -> Outcome:
         outcome.late = statistics.late
         outcome.used_late = late.used
     return outcome
+
+
+async def _settled(scene: Scene) -> None:
+    """Wait until all chargers have a reading, and the line is quiet."""
+    loop = asyncio.get_running_loop()
+    line = scene.bus.line
+    while (  # noqa: ASYNC110 - there is no event for silence
+        not all(one.available for one in scene.chargers)
+        or loop.time() - line.last_activity < QUIET
+    ):
+        await asyncio.sleep(QUIET / 10)
 
 
 def _turns(charger: Charger) -> list[float]:

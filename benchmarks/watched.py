@@ -132,6 +132,8 @@ class Scene(ABC):
 
     allowed_over: float = 15.0
     """Time in which a lower limit must have arrived, s."""
+    dials: bool = False
+    """The box dials: its bus gets the line later."""
 
     def __init__(self) -> None:
         """Make the chargers in `make`."""

@@ -214,6 +214,7 @@ class EwsScene(Scene):
 class EwsNetworkScene(EwsScene):
     """The same box, which dials."""
 
+    dials = True
     listener: Listener
 
     @override

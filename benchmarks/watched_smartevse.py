@@ -12,6 +12,7 @@ from custom_components.evse_bus.evse.smartevse import (
     SlaveConfig,
 )
 from tests.virtual import SmartEvse, VirtualBus
+from tests.virtual.smartevse_states import pwm_of
 
 from .watched import LIMIT, TICK, Scene, WatchedBox, orders, visiting_car
 from .witness import LimitWatch, Values
@@ -26,7 +27,7 @@ ERRORS: Final = {
 }
 """By the manual's table of 0x00A1."""
 NO_COMM: Final = 2
-OFFERING: Final = ("B", "C", "D", "G", "H", "G+")
+OFFERING: Final = ("B", "C", "D", "G", "G+")
 SUPPLY: Final = 25.0
 """A for three slaves, each of which may ask for 16 A."""
 
@@ -59,7 +60,7 @@ class WatchedSmartEvse(WatchedBox[SmartEvse]):
             "allowed": box.access,
             # The register has the next current as soon as there is a car; the pilot
             # follows with the next cycle.
-            "offered": box.outlet.current / 10 if box.state in OFFERING else 0.0,
+            "offered": pwm_of(box.outlet.current) if box.state in OFFERING else 0.0,
             "faults": frozenset(one for bit, one in ERRORS.items() if error & bit),
             "temperature": box.outlet.temperature,
             "maximum": min(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 import signal
@@ -11,27 +10,33 @@ import threading
 import time
 from typing import TYPE_CHECKING
 
-from . import ews_cli
+from . import arguments, ews_cli
 from .abl import AblBox
+from .adapter import ModbusTcpGateway
 from .bus import VirtualBus
 from .car import Car, CarLife
-from .control import HELP, Control, describe
+from .commands import buses_of
+from .control import Control, describe
 from .evbox import EvboxChargePoint, Module
 from .ews_box import EwsBox
 from .smartevse import SmartEvse
-from .smartevse_registers import DIALECTS
+from .strangers import Strangers
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    import argparse
+    from collections.abc import Sequence
 
     from .device import Device
 
 STATUS_INTERVAL = 5.0
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(words: Sequence[str] | None = None) -> int:
     """Run until SIGTERM, SIGINT, or the end of --duration."""
-    options = _parser().parse_args(arguments)
+    options = arguments.parser().parse_args(words)
+    over = _interrupted()
+    if options.protocol == "strangers":
+        return _strangers(options, over)
     make = {"abl": _abl, "evbox": _evbox, "smartevse": _smartevse, "ews": _ews}
     devices = make[options.protocol](options)
     for device in devices:
@@ -50,15 +55,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         bus = VirtualBus.tcp(*devices, port=options.tcp, **settings)
     else:
         bus = VirtualBus.pty(*devices, link=options.pty or None, **settings)
-    bus.faults.byte_error_rate = options.error_rate
-    bus.faults.lose_rate = options.lose_rate
-    bus.faults.late_rate = options.late_rate
-    bus.faults.late_by = options.late_by
-    bus.faults.noise_rate = options.noise_rate
-    bus.faults.echo = options.echo
-    over = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: over.set())
+    for one in buses_of(bus):
+        _disturb(one, options)
     with bus:
         _print(f"ready {options.protocol} {bus.url}")
         if options.control:
@@ -71,6 +69,54 @@ def main(arguments: Sequence[str] | None = None) -> int:
             text = json.dumps(bus.stats(), indent=2) + "\n"
             Path(options.stats).write_text(text, encoding="utf-8")
     return 0
+
+
+def _interrupted() -> threading.Event:
+    """Return an event that SIGTERM and SIGINT set."""
+    over = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: over.set())
+    return over
+
+
+def _strangers(options: argparse.Namespace, over: threading.Event) -> int:
+    host, _, port = options.dial.rpartition(":")
+    crowd = Strangers(
+        host or "127.0.0.1",
+        int(port),
+        count=options.count,
+        kind=options.kind,
+        rate=options.rate,
+        seed=options.seed,
+    )
+    with crowd:
+        _print(f"ready strangers {crowd.url}")
+        end = time.monotonic() + (options.duration or float("inf"))
+        while not over.is_set() and (left := end - time.monotonic()) > 0:
+            over.wait(min(left, STATUS_INTERVAL))
+            if options.verbose:
+                _print(str(crowd.stats()))
+        if options.stats:
+            text = json.dumps(crowd.stats(), indent=2) + "\n"
+            Path(options.stats).write_text(text, encoding="utf-8")
+    return 0
+
+
+def _disturb(bus: VirtualBus, options: argparse.Namespace) -> None:
+    """Set faults and adapter of a bus."""
+    faults, adapter = bus.faults, bus.adapter
+    faults.byte_error_rate = options.error_rate
+    faults.damage = tuple(options.damage)
+    faults.lose_rate = options.lose_rate
+    faults.late_rate = options.late_rate
+    faults.late_by = options.late_by
+    faults.noise_rate = options.noise_rate
+    faults.echo = options.echo
+    adapter.delay_out, adapter.delay_in = options.delay[0], options.delay[-1]
+    adapter.jitter = options.jitter
+    adapter.idle_timeout = options.idle_timeout
+    if options.gateway:
+        adapter.gateway = ModbusTcpGateway(options.gateway)
 
 
 def _run(bus: VirtualBus, options: argparse.Namespace, over: threading.Event) -> None:
@@ -137,6 +183,7 @@ def _abl(options: argparse.Namespace) -> list[Device]:
             tells_icmax=not options.no_icmax,
             turn_round=options.turn_round,
             boot_time=options.boot_time,
+            wakes_on=options.wakes_on,
         )
         box.id_applies = "write" if options.id_at_once else "reset"
         box.reset_answer = options.reset_answer
@@ -144,7 +191,14 @@ def _abl(options: argparse.Namespace) -> list[Device]:
         box.outlet.default_duty = options.default_duty
         box.outlet.idle_floor = options.idle_floor
         box.outlet.icmax_delay = box.outlet.ic_delay = options.effect_delay
+        box.stray = options.stray
         box.outlet.e0_after_pause = options.e0_after_pause
+        box.outlet.pause_forced_after = options.pause_forced_after
+        box.outlet.pause_in_ic = options.pause_in_ic
+        box.outlet.above_default = options.above_default
+        box.outlet.low_codes_taken = options.low_codes
+        box.outlet.offered_reads_zero = options.offered_zero
+        box.outlet.meter_bit = True if options.meter_bit else None
         box.lost_asleep_each = options.lost_asleep
         boxes.append(box)
     return boxes
@@ -163,15 +217,15 @@ def _evbox(options: argparse.Namespace) -> list[Device]:
             )
             for number in range(count)
         ]
-        points.append(
-            EvboxChargePoint(
-                serial,
-                modules,
-                max_current=options.max_current,
-                min_interval=options.min_interval,
-                commands=set(options.commands),
-            )
+        point = EvboxChargePoint(
+            serial,
+            modules,
+            max_current=options.max_current,
+            min_interval=options.min_interval,
+            commands=set(options.commands),
         )
+        point.ignore_limit = options.ignore_limit
+        points.append(point)
     return points
 
 
@@ -200,160 +254,3 @@ def _smartevse(options: argparse.Namespace) -> list[Device]:
 
 def _ews(options: argparse.Namespace) -> list[Device]:
     return ews_cli.boxes(options, _car)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="virtual-chargers",
-        description="Virtual chargers on a virtual RS-485 bus, at the line's real pace."
-        " Prints `ready <protocol> <url>` when a client may open it.",
-    )
-    kinds = parser.add_subparsers(dest="protocol", required=True)
-    abl = kinds.add_parser("abl", help="ABL EVCC2/3 boxes")
-    _common(abl.add_argument)
-    add = abl.add_argument
-    add(
-        "--ids",
-        type=int,
-        nargs="+",
-        default=[1],
-        help="device-IDs; an ID twice: two boxes",
-    )
-    add("--no-meter", action="store_true", help="no phase-current meter")
-    add("--default-current", type=float, default=16.0, metavar="A")
-    add("--sleep", type=float, metavar="S", help="sleep after S seconds of silence")
-    add(
-        "--upstream-timeout",
-        type=float,
-        metavar="S",
-        help="F4 after S seconds without polling",
-    )
-    add(
-        "--extra-registers",
-        action="store_true",
-        help="register 0x04 can be read too",
-    )
-    add("--no-icmax", action="store_true", help="register 0x0F is not answered")
-    add(
-        "--default-duty",
-        type=lambda text: int(text, 0),
-        metavar="CODE",
-        help="Idefault as boxes report it: 0x10B on those of 16 A",
-    )
-    add("--idle-floor", type=int, default=0, metavar="N", help="0.1 A on idle phases")
-    add(
-        "--effect-delay",
-        type=float,
-        default=0.0,
-        metavar="S",
-        help="time from a write of a limit or a pause to its effect",
-    )
-    add(
-        "--e0-after-pause",
-        type=float,
-        metavar="S",
-        help="goes to E0 by itself after a pause of S seconds",
-    )
-    add("--lost-asleep", type=int, default=1, metavar="N", help="requests lost asleep")
-    add("--turn-round", type=float, default=0.002, metavar="S")
-    add("--boot-time", type=float, default=0.3, metavar="S", help="deaf after a reset")
-    add(
-        "--id-at-once", action="store_true", help="a new ID counts before the reset too"
-    )
-    add(
-        "--reset-answer",
-        choices=["before", "after", "never"],
-        default="before",
-        help="when a reset is confirmed",
-    )
-    add("--l1-first", action="store_true", help="L1 in the first word, not the third")
-    evbox = kinds.add_parser("evbox", help="EVBox ChargePoints (Protocol Max v4)")
-    _common(evbox.add_argument)
-    add = evbox.add_argument
-    add("--serials", type=int, nargs="+", default=[1923054])
-    add(
-        "--modules",
-        type=int,
-        nargs="+",
-        default=[1],
-        help="one number for each ChargePoint",
-    )
-    add("--max-current", type=float, default=35.0, metavar="A")
-    add("--min-current", type=float, default=6.0, metavar="A")
-    add("--min-interval", type=int, default=1, metavar="S")
-    add("--commands", type=int, nargs="+", default=[68, 69], choices=[68, 69])
-    smartevse = kinds.add_parser("smartevse", help="SmartEVSE v2 boxes")
-    _common(smartevse.add_argument)
-    add = smartevse.add_argument
-    add("--dialect", choices=list(DIALECTS), default="2.17", help="the firmware")
-    add(
-        "--load-balance",
-        type=int,
-        nargs="+",
-        default=[0],
-        metavar="N",
-        help="for each box: 0 off, 1 master, 2 to 8 slaves; also its address",
-    )
-    add("--unit", type=int, help="address with load balancing off, if not the default")
-    add("--cables", type=int, nargs="+", default=[16], choices=[13, 16, 32, 63])
-    add("--fixed-cable", action="store_true", help="no socket: --max-current counts")
-    add("--max-current", type=int, default=13, metavar="A")
-    add("--min-current", type=int, default=6, metavar="A")
-    add("--mode", type=int, choices=[0, 1, 2], default=0, help="normal, smart, solar")
-    add("--serial", type=int, default=1, help="of the first box; dialect later only")
-    add(
-        "--no-override", action="store_true", help="the boxes ignore a charging current"
-    )
-    add("--turn-round", type=float, default=0.01, metavar="S")
-    ews = kinds.add_parser("ews", help="P-CHARGE EWS-Boxes (MCS binary)")
-    _common(ews.add_argument)
-    ews_cli.add_arguments(ews.add_argument)
-    return parser
-
-
-def _common(add: Callable[..., object]) -> None:
-    add("--tcp", type=int, metavar="PORT", help="a TCP port of this machine; 0 = any")
-    add(
-        "--pty", nargs="?", const="", metavar="LINK", help="a pseudo-terminal (default)"
-    )
-    add("--baud", type=int)
-    add("--parity", choices=["N", "E", "O"])
-    add("--cars", choices=["auto", "plugged", "none"], default="none")
-    for name, unit, usual in (
-        ("away", "seconds", CarLife.away),
-        ("wants", "Wh", CarLife.wants_wh),
-    ):
-        add(
-            f"--{name}",
-            type=float,
-            nargs=2,
-            default=usual,
-            metavar=("MIN", "MAX"),
-            help=f"{unit}, of cars that come and go by themselves",
-        )
-    add(
-        "--time-scale", type=float, default=1.0, help="cars and time-outs, not the wire"
-    )
-    add(
-        "--granularity",
-        type=float,
-        default=0.002,
-        help="seconds for each chunk of a reply",
-    )
-    add("--seed", type=int, default=0)
-    add("--dead", type=int, nargs="+", default=[], help="IDs, units or serials")
-    add(
-        "--error-rate",
-        type=float,
-        default=0.0,
-        help="probability that a byte is damaged",
-    )
-    add("--lose-rate", type=float, default=0.0, help="probability that a reply is lost")
-    add("--late-rate", type=float, default=0.0, help="probability that a reply is late")
-    add("--late-by", type=float, default=0.5, metavar="S")
-    add("--noise-rate", type=float, default=0.0, help="noise bytes per second")
-    add("--echo", action="store_true", help="the adapter echoes the client's bytes")
-    add("--control", action="store_true", help=f"read commands from stdin: {HELP}")
-    add("--duration", type=float, metavar="S", help="end after S seconds")
-    add("--stats", metavar="FILE", help="write the counters as JSON at the end")
-    add("--verbose", action="store_true", help="print the state every 5 s")

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from . import ews_cli
 from .abl import AblBox
+from .commands import ALL, BUS, CARS, CHARGERS
 from .evbox import EvboxChargePoint
 from .ews_box import EwsBox
 from .smartevse import SmartEvse
@@ -16,14 +17,6 @@ if TYPE_CHECKING:
     from .bus import VirtualBus
     from .car import Car
     from .device import Device
-
-HELP = (
-    "plug|request|finish|leave ID[.MODULE]; dead|alive|power-cycle ID;"
-    " off|on ID (of an ABL box; its serial number too, where two have one ID);"
-    " fail ID N; clear ID; stop|start ID; others ID A;"
-    " press ID; menu ID SETTING N; temperature ID C;"
-    f" unplug-adapter; replug-adapter; advance S; status; {ews_cli.HELP}"
-)
 
 
 class Control:
@@ -40,82 +33,27 @@ class Control:
         if not words:
             return
         try:
-            self._reply(self._do(words[0], words[1:]))
+            self._reply(self._bus.call(lambda: self._do(words[0], words[1:])))
         except (IndexError, KeyError, TypeError, ValueError) as error:
             self._reply(f"error {text.strip()}: {error}")
 
     def _do(self, word: str, values: list[str]) -> str:
-        bus = self._bus
         if word == "status":
-            return bus.call(lambda: describe(bus))
-        if word in ("unplug-adapter", "replug-adapter"):
-            (bus.unplug if word == "unplug-adapter" else bus.replug)()
-        elif word == "advance":
-            bus.advance(float(values[0]))
-        elif word in ("plug", "request", "finish", "leave"):
-            car = self._car(values[0])
-            {
-                "plug": car.plug_in,
-                "request": car.request,
-                "finish": car.finish,
-                "leave": car.leave,
-            }[word]()
+            return describe(self._bus)
+        if word in BUS:
+            BUS[word].run(self._bus, values)
+        elif word in CARS:
+            CARS[word].run(self._car(values[0]), values[1:])
         else:
-            device = self._device(values[0])
-            port = int(values[0].partition(".")[2] or 1)
-            if not (
-                isinstance(device, EwsBox)
-                and ews_cli.command(device, word, port, values[1:])
-            ):
-                self._device_command(word, device, values[1:])
+            key, *rest = values
+            device = self._device(key)
+            commands = {**ALL, **CHARGERS.get(type(device), {})}
+            if word not in commands:
+                names = ", ".join(sorted({*commands, *CARS, *BUS, "status"}))
+                msg = f"no such command; there are: {names}"
+                raise ValueError(msg)
+            commands[word].run(device, int(key.partition(".")[2] or 1), rest)
         return "ok"
-
-    def _device_command(self, word: str, device: Device, values: list[str]) -> None:
-        if word in ("dead", "alive"):
-            device.faults.dead = word == "dead"
-        elif word == "power-cycle" and isinstance(
-            device, AblBox | EvboxChargePoint | SmartEvse | EwsBox
-        ):
-            device.power_cycle()
-        elif isinstance(device, SmartEvse):
-            self._smartevse_command(word, device, values)
-        elif isinstance(device, AblBox):
-            self._abl_command(word, device, values)
-        else:
-            msg = f"{device.name} has no command {word}"
-            raise TypeError(msg)
-
-    def _abl_command(self, word: str, device: AblBox, values: list[str]) -> None:
-        if word in ("off", "on"):
-            (device.switch_off if word == "off" else device.switch_on)()
-        elif word == "fail":
-            device.fail(int(values[0]))
-        elif word == "clear":
-            device.clear_failure()
-        elif word == "stop":
-            device.stop_locally()
-        elif word == "start":
-            device.start_locally()
-        elif word == "others":
-            device.set_by_other_master(float(values[0]))
-        else:
-            msg = f"no such command; there are: {HELP}"
-            raise ValueError(msg)
-
-    def _smartevse_command(
-        self, word: str, device: SmartEvse, values: list[str]
-    ) -> None:
-        if word == "press":
-            device.press_access()
-        elif word == "menu":
-            device.set_at_the_box(values[0], int(values[1]))
-        elif word == "others":
-            device.set_by_other_master(float(values[0]))
-        elif word == "temperature":
-            device.outlet.temperature = int(values[0])
-        else:
-            msg = f"no such command; there are: {HELP}"
-            raise ValueError(msg)
 
     def _device(self, key: str) -> Device:
         key = key.partition(".")[0]

@@ -98,6 +98,7 @@ class EvboxChargePoint(Device):
     - `counters`: refused and malformed requests
     - `serial` can be set: another ChargePoint in its place
     - `min_interval` (s): reported in the reply, and enforced in real time
+    - `ignore_limit`: takes orders without effect (a defect)
     - `too_soon_restarts`: a request within it begins it anew (no source settles that)
     """
 
@@ -132,6 +133,7 @@ class EvboxChargePoint(Device):
         self.counters = Counters()
         self.orders: list[Order] = []
         self.failed_back = False
+        self.ignore_limit = False
         self._finder = FrameFinder()
         self._standing: _Standing | None = None
         self._distortions: list[Distortion] = []
@@ -146,7 +148,7 @@ class EvboxChargePoint(Device):
         connection" (command 68, note **).
         """
         standing = self._standing
-        if standing is None:
+        if standing is None or self.ignore_limit:
             return (self.max_current,) * 3
         return self._capped(standing.fallback if self.failed_back else standing.limits)
 

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, cast
 from .ews_box import EwsBox
 from .ews_dialler import EwsDialler
 from .ews_driver import Driver
-from .ews_rfid import Card
 from .faults import Faults
 
 if TYPE_CHECKING:
@@ -22,11 +21,6 @@ if TYPE_CHECKING:
 
     T = TypeVar("T")
 
-HELP = (
-    "EWS: press ID.PORT KEY [S]; card ID [GROUP CARD]; remove-card ID;"
-    " web-start|web-stop ID.PORT; rcd|fan ID.PORT on|off;"
-    " jam ID.PORT lock|unlock|free; plug-cable|pull-cable ID.PORT; hang-up|vanish ID"
-)
 FIRST_SERIAL = 12345678901
 
 
@@ -107,18 +101,49 @@ def add_arguments(add: Callable[..., object]) -> None:
     add("--retry", type=float, default=0.5, metavar="S", help="between two attempts")
     add("--serials", nargs="+", metavar="SERIAL", help="12 digits each")
     add("--count", type=int, default=1, help="number of boxes, without --serials")
-    add("--jumper", type=int, default=32, choices=[13, 20, 32, 63, 70])
+    add(
+        "--jumper",
+        type=int,
+        default=32,
+        choices=[13, 20, 32, 63, 70],
+        help="highest current, A",
+    )
     add("--max-current", type=int, default=0, metavar="A", help="0: that of the jumper")
+    add(
+        "--mode1",
+        type=int,
+        nargs="+",
+        default=[],
+        choices=[1, 2],
+        help="ports that are household sockets: 16 A or nothing",
+    )
+    add("--cable", type=int, default=32, metavar="A", help="of both ports")
     add("--drivers", action="store_true", help="press start when a car requests charge")
     add("--standalone", action="store_true", help="not in server mode")
     add("--rfid", action="store_true", help="with card authentication")
     add("--manual-io", action="store_true", help="the server handles keys and LEDs")
     add("--exclusive", action="store_true", help="one port at a time")
-    add("--fixed-cable", action="store_true")
+    add("--fixed-cable", action="store_true", help="no sockets, no locks")
     add("--fan", action="store_true", help="with ventilation")
-    add("--restart-after-power", action="store_true")
-    add("--bcc", choices=["all", "without_msgid"], default="all")
-    add("--masking", choices=["no", "zeros", "stars"], default="no")
+    add(
+        "--restart-after-power",
+        action="store_true",
+        help="a charge goes on by itself after a power failure",
+    )
+    add("--power-backup", action="store_true", help="0xF0 for 260 s after power-up")
+    add(
+        "--bcc",
+        choices=["all", "without_msgid"],
+        default="all",
+        help="what its checksum covers; the manual has both",
+    )
+    add(
+        "--masking",
+        choices=["no", "zeros", "stars"],
+        default="no",
+        help="of passwords that are read",
+    )
+    add("--ignore-limit", action="store_true", help="takes limits without effect")
 
 
 def boxes(
@@ -147,9 +172,15 @@ def boxes(
             fan=options.fan,
             restart_after_power=options.restart_after_power,
             masking=options.masking,
+            mode1=(1 in options.mode1, 2 in options.mode1),
+            power_backup=options.power_backup,
         )
         for index, serial in enumerate(serials)
     ]
+    for box in made:
+        box.ignores_limits = options.ignore_limit
+        for port in box.ports:
+            port.cable = options.cable
     if options.drivers:
         for index, box in enumerate(made):
             box.drivers = [
@@ -175,39 +206,6 @@ def fleet(
         **cast("dict[str, float]", chosen),
     )
     return cast("VirtualBus", made)
-
-
-def command(box: EwsBox, word: str, port: int, values: list[str]) -> bool:
-    """Execute a control command; return False if it is none of a box."""
-    charging_port = box.ports[port - 1]
-    if word == "press":
-        seconds = float(values[1]) if len(values) > 1 else 0.3
-        box.press_key(port, int(values[0]), seconds)
-    elif word == "card":
-        group, number = [*(int(value) for value in values), 1, 1][:2]
-        box.present_card(Card(group, number))
-    elif word == "remove-card":
-        box.remove_card()
-    elif word in ("web-start", "web-stop"):
-        (box.start_on_web_page if word == "web-start" else box.stop_on_web_page)(port)
-    elif word == "rcd":
-        box.trip_rcd(port, tripped=values[0] == "on")
-    elif word == "fan":
-        charging_port.wants_fan = values[0] == "on"
-    elif word == "jam":
-        jammed = {"lock": "lock", "unlock": "unlock", "free": ""}[values[0]]
-        charging_port.lock.jammed = jammed  # type: ignore[assignment]
-    elif word in ("plug-cable", "pull-cable"):
-        (
-            charging_port.plug_cable
-            if word == "plug-cable"
-            else charging_port.pull_cable
-        )()
-    elif word in ("hang-up", "vanish") and isinstance(box.bus, EwsDialler):
-        (box.bus.hang_up if word == "hang-up" else box.bus.vanish)()
-    else:
-        return False
-    return True
 
 
 def describe_box(box: EwsBox) -> str:

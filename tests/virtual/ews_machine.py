@@ -42,6 +42,8 @@ class PortMachine:
         self.rcd_tripped = self.meter_broken = self.wants_fan = False
         self.pause_status: Literal[0x50, 0x42] = 0x50
         self.search_time = 0.3
+        # Totals that the next answers report in place of the meter's: it fails.
+        self.meter_reads: list[float] = []
         self.server_paused = False
         self.cable_in = False
         self.on_event: Callable[[], None] = lambda: None

@@ -65,6 +65,7 @@ def _port_status(box: EwsBox, port: EwsPort) -> bytes:
     if port.installation.fixed_cable and not mode1:
         cable = port.ceiling
     volts = PROXIMITY.get(cable or None, PROXIMITY[None])
+    total = port.meter_reads.pop(0) if port.meter_reads else session.total_wh
     return RC.pack(
         port.status,
         cable or 0,
@@ -77,7 +78,7 @@ def _port_status(box: EwsBox, port: EwsPort) -> bytes:
         int(session.wh),
         int(session.last_seconds),
         int(session.last_wh),
-        int(session.total_wh) & 0xFFFFFFFF,
+        int(total) & 0xFFFFFFFF,
         session.cycles,
         port.locked,
         port.contactor,

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Literal
 if TYPE_CHECKING:
     from random import Random
 
-Kind = Literal["lose", "late", "duplicate", "truncate", "corrupt", "replace", "noise"]
+Kind = Literal[
+    "lose", "late", "duplicate", "truncate", "corrupt", "twin", "replace", "noise"
+]
 Damage = Literal["flip", "replace", "drop", "insert"]
 DAMAGES: tuple[Damage, ...] = ("flip", "replace", "drop", "insert")
 
@@ -45,6 +47,7 @@ class Faults:
         - `duplicate`: sent twice
         - `truncate`: cut to its first `value` bytes (default half)
         - `corrupt`: one bit of byte `value` flips (default the middle one)
+        - `twin`: the same bit flips in two bytes, which an XOR of all does not show
         - `replace`: the bytes `value` are sent in its place
         - `noise`: the bytes `value` are sent just before it
         """
@@ -126,6 +129,12 @@ class Faults:
             index = len(data) // 2 if number is None else int(number)
             damaged = bytearray(data)
             damaged[index] ^= 1 << rng.randrange(7)
+            first = [(delay, bytes(damaged))]
+        elif kind == "twin":
+            damaged, bit = bytearray(data), 1 << rng.randrange(8)
+            # Neither the first byte nor the last one: they delimit a frame.
+            for index in rng.sample(range(1, len(data) - 1), 2):
+                damaged[index] ^= bit
             first = [(delay, bytes(damaged))]
         elif kind != "lose":
             other = value if isinstance(value, bytes) else b"\x00\xff"
