@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 from custom_components.evse_bus.evse.abl import reader
-from custom_components.evse_bus.evse.errors import WrongChargerError
+from custom_components.evse_bus.evse.errors import GarbledReplyError, WrongChargerError
 from custom_components.evse_bus.evse.model import Capability, Fault, OrderChange, Status
 from tests.virtual import AblBox, Car, Request
 
@@ -264,3 +264,42 @@ async def test_two_boxes_do_not_mix() -> None:
             two.change_orders(OrderChange(current=7)),
         )
         assert [box.limits_written for box in scene.boxes] == [[166, 150], [133, 116]]
+
+
+@pytest.mark.parametrize("serials", [("2W22xy00000001", "2W22xy00000002"), ("", "")])
+@pytest.mark.parametrize("later", [0.0, 0.003, 0.02, 0.05, 0.1, 0.2])
+async def test_a_second_box_that_replies_later_gets_no_orders(
+    later: float, serials: tuple[str, str]
+) -> None:
+    one = AblBox(1, serial=serials[0], jitter=0.0)
+    two = AblBox(1, serial=serials[1], turn_round=0.002 + later, jitter=0.0)
+    two.on = False
+    async with Scene(one, two) as scene:
+        charger = scene.add(config(poll_interval=2.0), orders(10))
+        await until(lambda: charger.available and one.ic_amps < 10.1)
+        two.switch_on()
+        # Three of its replies have come too late by then.
+        await asyncio.sleep(12)
+        with pytest.raises(GarbledReplyError):
+            await charger.change_orders(OrderChange(current=8))
+        await until(lambda: Fault.DUPLICATE_ADDRESS in charger.faults, 60)
+        assert not charger.available
+        assert two.writes == []
+        # The lowering stands, and is sent as soon as it is alone.
+        two.switch_off()
+        await until(lambda: charger.available and one.ic_amps < 8.1, 60)
+        assert Fault.DUPLICATE_ADDRESS not in charger.faults
+        assert two.writes == []
+
+
+async def test_a_reply_too_many_is_no_second_box() -> None:
+    box = AblBox(1)
+    async with Scene(box) as scene:
+        charger = scene.add(config(poll_interval=2.0), orders(10))
+        await until(lambda: charger.available and box.ic_amps < 10.1)
+        box.faults.once("duplicate")
+        await asyncio.sleep(10)
+        assert charger.available
+        assert not charger.faults
+        await charger.change_orders(OrderChange(current=8))
+        assert box.ic_amps < 8.1

@@ -4,11 +4,14 @@ The identity is checked after each (re)connect and after each missed reply, befo
 anything else is exchanged (PROTOCOLS.md, 2).
 """
 
+import asyncio
+from collections import deque
 from dataclasses import replace
 from math import inf
 from typing import ClassVar, Final, override
 
 from ..charger import Charger
+from ..conversation import FollowUp
 from ..errors import (
     ExchangeRefusedError,
     GarbledReplyError,
@@ -16,9 +19,12 @@ from ..errors import (
     WrongChargerError,
 )
 from ..exchange import Turn
+from ..framing import Frame
+from ..modbus import ModbusFrame
 from ..model import ChargerConfig, Fault, Orders, OrderState
 from ..pause_watch import FOLLOW_TIME, NO_CURRENT
 from ..registers import Registers
+from .collect import collect
 from .config import TIMING, AblConfig, Pauses
 from .decisions import (
     Decision,
@@ -53,6 +59,11 @@ from .registers import (
 )
 from .states import E0
 
+SURPLUS_REPLIES: Final = 3
+"""Replies that belong to no request, within `SURPLUS_TIME`, that suggest a second box;
+a damaged reply or one too many does not."""
+SURPLUS_TIME: Final = 10.0
+"""s"""
 FLAGS_INTERVAL: Final = 30.0
 """Time between two reads of the system flags, s."""
 FLAGS_MISSES: Final = 3
@@ -113,6 +124,10 @@ class AblReader(Charger[AblConfig]):
         self._flags: Flags | None = None
         self._check = StatusCheck()
         self._identified = False
+        self._surplus: deque[float] = deque(maxlen=SURPLUS_REPLIES)
+        """Loop times of the last replies that belong to no request, s."""
+        self._doubted = False
+        """Perhaps a second, slower box answers, too."""
         self._flags_due = 0.0
         self._flags_missed = 0
         self._energy = EnergyEstimate(config.poll_interval)
@@ -135,9 +150,9 @@ class AblReader(Charger[AblConfig]):
     @property
     @override
     def exchanges_per_turn(self) -> int:
-        # Identity (info, serial, each twice), status three times, Icmax twice, limit,
-        # status and Icmax twice.
-        return 14
+        # Identity (info, serial, each twice; serial for a second box), status three
+        # times, Icmax twice, limit, status and Icmax twice.
+        return 15
 
     # -- Identity ----------------------------------------------------------------
 
@@ -198,6 +213,8 @@ class AblReader(Charger[AblConfig]):
             self.set_unavailable(message)
             raise WrongChargerError(message, expected=expected, found=found)
         self.notice(Fault.WRONG_CHARGER, present=False)
+        if self._doubted:
+            await self._require_alone(turn, serial)
         if serial != self._serial:
             self.box.replaced()
         self._serial = serial
@@ -207,6 +224,37 @@ class AblReader(Charger[AblConfig]):
             self.box.reports_icmax = True
         self._identified = True
         self.info = charger_info(info, serial, self._flags)
+
+    async def _require_alone(self, turn: Turn, serial: str | None) -> None:
+        """Wait for all replies to one read; raises GarbledReplyError for two boxes."""
+        address = self.config.address
+        if serial is None:
+            is_alone = len(await collect(turn, address, INFO, disturbed=False)) == 1
+        else:
+            replies = await collect(turn, address, SERIAL, disturbed=False)
+            is_alone = all(one.number == serial for one in replies)
+        if not is_alone:
+            message = f"several boxes answer at device-ID {address}"
+            raise GarbledReplyError(message)
+        self._surplus.clear()
+        self._doubted = False
+
+    @override
+    def on_unsolicited(self, frame: Frame) -> FollowUp | None:
+        if (
+            isinstance(frame, ModbusFrame)
+            and frame.is_reply
+            and frame.unit == self.config.address
+        ):
+            # The first reply is taken for the reply: a slower box with the same
+            # device-ID shows only here, and obeys the same writes.
+            now = asyncio.get_running_loop().time()
+            self._surplus.append(now)
+            several = len(self._surplus) == SURPLUS_REPLIES
+            if several and now - self._surplus[0] <= SURPLUS_TIME:
+                self._doubted = True
+                self._identified = False
+        return None
 
     async def _read_serial(self, turn: Turn, expected: str | None) -> str | None:
         """Return the serial number; ``None`` from a box that has none.
