@@ -32,6 +32,7 @@ from .evse.errors import LineError
 from .identity import identity_of, stands_on_serial
 from .issues import report_orders_written
 from .services import async_register
+from .stores.addresses import ADDRESSES, AddressStore
 from .stores.orders import ORDERS, OrderStore, bus_key, subentry_keys
 
 CONFIG_SCHEMA = cv.config_entry_only_config_schema(DOMAIN)
@@ -54,6 +55,7 @@ async def async_setup(
     """Register the actions and the stores, which all config entries share."""
     hass.data[ORDERS] = OrderStore(hass, partial(report_orders_written, hass))
     hass.data[TOTALS] = TotalStore(hass)
+    hass.data[ADDRESSES] = AddressStore(hass)
     async_register(hass)
     return True
 

@@ -25,6 +25,7 @@ from .evse.master import BusMaster
 from .evse.memory import LineMemory
 from .evse.model import ChargerConfig
 from .evse.recovery import PAUSES
+from .stores.addresses import ADDRESSES
 
 _LINES: Final[HassKey[dict[str, LineMemory]]] = HassKey(f"{DOMAIN}.lines")
 
@@ -126,7 +127,10 @@ class ListenerConnections(Connections):
     """A listener, and one bus for each configured box."""
 
     def __init__(
-        self, entry: ConfigEntry, on_unknown_box: Callable[[UnknownBox], None]
+        self,
+        hass: HomeAssistant,
+        entry: ConfigEntry,
+        on_unknown_box: Callable[[UnknownBox], None],
     ) -> None:
         """Create the listener; it does not accept connections yet.
 
@@ -139,6 +143,8 @@ class ListenerConnections(Connections):
             allowed=allowed_networks(entry.options),
             on_unknown_box=on_unknown_box,
         )
+        self._addresses = hass.data[ADDRESSES]
+        self.listener.on_new_address = self._addresses.put
         self._buses: dict[str, Bus] = {}
         self._started = False
 
@@ -174,7 +180,8 @@ class ListenerConnections(Connections):
     @override
     async def acquire_bus(self, config: ChargerConfig, name: str) -> Bus:
         serial = config.serial or ""
-        bus = self._buses[serial] = self.listener.register(serial, name)
+        addresses = await self._addresses.async_get(serial)
+        bus = self._buses[serial] = self.listener.register(serial, name, addresses)
         if self._started:
             await bus.start()
         return bus
@@ -212,7 +219,7 @@ def make_connections(
 ) -> Connections:
     """Return the connections of a config entry; nothing is opened."""
     if protocol_of(entry.data).dials_in:
-        return ListenerConnections(entry, on_unknown_box)
+        return ListenerConnections(hass, entry, on_unknown_box)
     return PortConnection(hass, entry)
 
 
