@@ -8,6 +8,7 @@ from pathlib import Path
 import re
 from typing import TYPE_CHECKING, Any
 
+from homeassistant.components.repairs import repairs_flow_manager
 from homeassistant.config_entries import (
     SOURCE_IGNORE,
     SOURCE_INTEGRATION_DISCOVERY,
@@ -23,8 +24,9 @@ from homeassistant.data_entry_flow import (
     FlowResultType,
     section,
 )
-from homeassistant.helpers import config_validation as cv
+from homeassistant.helpers import config_validation as cv, issue_registry as ir
 from homeassistant.helpers.selector import NumberSelector, SelectSelector
+from homeassistant.setup import async_setup_component
 import probatio as vol
 
 from custom_components.evse_bus.const import DOMAIN, SUBENTRY_CHARGER
@@ -98,6 +100,20 @@ class Flow:
         return await cls._charger(hass, entry, context)
 
     @classmethod
+    async def change_settings(
+        cls, hass: HomeAssistant, entry: ConfigEntry, subentry: ConfigSubentry
+    ) -> Flow:
+        flow = await cls.change_charger(hass, entry, subentry)
+        return await flow.choose("settings")
+
+    @classmethod
+    async def replace_charger(
+        cls, hass: HomeAssistant, entry: ConfigEntry, subentry: ConfigSubentry
+    ) -> Flow:
+        flow = await cls.change_charger(hass, entry, subentry)
+        return await flow.choose("replace")
+
+    @classmethod
     async def _charger(
         cls, hass: HomeAssistant, entry: ConfigEntry, context: dict[str, Any]
     ) -> Flow:
@@ -105,6 +121,20 @@ class Flow:
         flow.texts = english()["config_subentries"][SUBENTRY_CHARGER]
         flow.manager = hass.config_entries.subentries
         await flow._start((entry.entry_id, SUBENTRY_CHARGER), context)
+        return flow
+
+    @classmethod
+    async def repair(cls, hass: HomeAssistant, key: str) -> Flow:
+        """Open the flow that fixes an issue."""
+        assert await async_setup_component(hass, "repairs", {})
+        manager = repairs_flow_manager(hass)
+        assert manager is not None
+        found = issue(hass, key)
+        assert found is not None
+        flow = cls(hass)
+        flow.texts = english()["issues"][found.translation_key]["fix_flow"]
+        flow.manager = manager
+        await flow._start(DOMAIN, {"issue_id": key})
         return flow
 
     @classmethod
@@ -366,3 +396,18 @@ def charger(name: str, limit: float = 16, **more: object) -> dict[str, Any]:
         "fail_safe_current": 6,
         "expert": {},
     } | more
+
+
+def issue(hass: HomeAssistant, key: str) -> ir.IssueEntry | None:
+    """Return an issue whose texts are there and fit its placeholders."""
+    found = ir.async_get(hass).async_get_issue(DOMAIN, key)
+    if found is None:
+        return None
+    assert found.translation_key is not None
+    texts = dict(english()["issues"][found.translation_key])
+    if fix := texts.pop("fix_flow", None):
+        texts |= fix["step"]["confirm"]
+        assert found.is_fixable
+    for text in texts.values():
+        assert text.format(**found.translation_placeholders or {})
+    return found

@@ -475,7 +475,7 @@ async def test_a_bus_that_does_not_run_offers_only_the_settings(
         hass, "abl", "/dev/nothing", stored_charger("abl", 1, serial=serial(1))
     )
     flow = await Flow.change_charger(hass, entry, get(entry, "Charger 1"))
-    assert flow.step == "reconfigure"
+    assert flow.result["menu_options"] == ["settings", "replace"]
     flow.abort()
 
 

@@ -207,12 +207,11 @@ async def test_nobody_answers_then_the_first_box_that_comes_is_kept(
             hass, lambda: all(one.charger.config.serial == SERIAL for one in chargers)
         )
 
-        # It is shown where it can be changed, and changing a name does not lose it.
+        # Changing a name does not lose it.
         opened = bus.opened
-        flow = await Flow.change_charger(hass, entry, yard)
-        assert fields(flow)["box_serial"] == SERIAL
-        renamed = {"name": "Garden", "box_serial": fields(flow)["box_serial"]}
-        typed = typed_box("Garden", 16, 16, expert=FAST) | renamed
+        flow = await Flow.change_settings(hass, entry, yard)
+        assert "box_serial" not in fields(flow)
+        typed = typed_box("Garden", 16, 16, expert=FAST)
         del typed["fail_safe_current"]
         await flow.submit(typed)
         assert flow.result["reason"] == "reconfigure_successful"

@@ -2,10 +2,8 @@
 
 from homeassistant.const import EVENT_STATE_CHANGED, EVENT_STATE_REPORTED
 from homeassistant.core import HomeAssistant, callback
-from homeassistant.helpers import issue_registry as ir
 import pytest
 
-from custom_components.evse_bus.const import DOMAIN
 from custom_components.evse_bus.coordinator import BUS
 from tests.common import (
     call,
@@ -17,18 +15,8 @@ from tests.common import (
     wait_for_state,
     wait_until,
 )
-from tests.flow import english
+from tests.flow import issue
 from tests.virtual import AblBox, Car, EvboxChargePoint, Module, VirtualBus
-
-
-def issue(hass: HomeAssistant, key: str) -> ir.IssueEntry | None:
-    """Return an issue whose texts are there and fit its placeholders."""
-    found = ir.async_get(hass).async_get_issue(DOMAIN, key)
-    if found is not None:
-        texts = english()["issues"][found.translation_key]
-        for text in texts.values():
-            assert text.format(**found.translation_placeholders)
-    return found
 
 
 async def test_someone_elses_charger_answers(hass: HomeAssistant) -> None:
@@ -76,7 +64,7 @@ async def test_a_chargepoint_swapped_for_another(hass: HomeAssistant) -> None:
         hass.config_entries.async_update_subentry(
             entry,
             subentry,
-            data={**subentry.data, "serial": "1923055"},
+            data={**subentry.data, "serial": "1923055", "identity": "evbox_1923055"},
         )
         await wait_for_state(hass, maximum, "35.0")
         assert len(box.orders) > sent

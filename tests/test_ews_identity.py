@@ -5,7 +5,6 @@ import logging
 from typing import TYPE_CHECKING
 
 from homeassistant.core import HomeAssistant
-from homeassistant.helpers import issue_registry as ir
 import pytest
 
 from custom_components.evse_bus.const import DOMAIN
@@ -22,7 +21,7 @@ from tests.common import (
     wait_until,
 )
 from tests.ews import charge, limits, names, polled, quick_car
-from tests.flow import english
+from tests.flow import issue
 from tests.virtual import EwsBox, VirtualBus
 
 if TYPE_CHECKING:
@@ -36,16 +35,6 @@ READS = {"id", "rs", "rp", "rz", "rc", "rd"}
 def box_of(serial: str, **data: object) -> ConfigSubentryDataWithId:
     made = charger("ews", serial, serial=serial, title="Yard", **data)
     return {**made, "subentry_id": "ews01"}
-
-
-def issue(hass: HomeAssistant, key: str) -> ir.IssueEntry | None:
-    """Return an issue whose texts are there and fit its placeholders."""
-    found = ir.async_get(hass).async_get_issue(DOMAIN, key)
-    if found is not None:
-        texts = english()["issues"][found.translation_key]
-        for text in texts.values():
-            assert text.format(**found.translation_placeholders)
-    return found
 
 
 async def test_another_box_is_told_nothing(

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from homeassistant.config_entries import ConfigEntryState
 from homeassistant.core import HomeAssistant
+from homeassistant.data_entry_flow import FlowResultType
 from homeassistant.helpers import (
     area_registry as ar,
     device_registry as dr,
@@ -30,7 +31,7 @@ from tests.common import (
     wait_for_state,
     wait_until,
 )
-from tests.flow import Flow, charger, port_step
+from tests.flow import NOWHERE, Flow, charger, issue, port_step
 from tests.listening import dialling, listening, offered
 from tests.virtual import AblBox, EvboxChargePoint, EwsBox, Module, VirtualBus
 
@@ -112,6 +113,18 @@ async def all_there(hass: HomeAssistant, kept: Furnished) -> None:
     await wait_until(hass, lambda: len(ours(hass)) == len(kept.ids))
     await hass.async_block_till_done()
     kept.assert_kept(hass)
+
+
+async def replaced(hass: HomeAssistant, key: str) -> Flow:
+    """Open the repair of a box that was replaced, as soon as it is reported."""
+
+    def is_reported() -> bool:
+        found = issue(hass, key)
+        return found is not None and found.is_fixable
+
+    await wait_until(hass, is_reported)
+    assert issues(hass) == {key}
+    return await Flow.repair(hass, key)
 
 
 def issues(hass: HomeAssistant) -> set[str]:
@@ -282,6 +295,121 @@ async def test_another_box_takes_over_the_names_and_not_the_meter(
         assert (
             hass_storage[TOTALS_KEY]["data"]["evbox_1923054_1_energy"]["total"] == 5000
         )
+
+
+async def test_a_wrong_box_is_accepted_from_its_repair_issue(
+    hass: HomeAssistant,
+) -> None:
+    old, new = AblBox(1), AblBox(1, serial="2W22xy00000009")
+    async with running(hass, old, title="Charger") as (entry, bus):
+        await get_entity(hass, "sensor", entry, "1_estimated_energy")
+        limit = await get_entity(hass, "number", entry, "charging_current")
+        await call(hass, "number.set_value", limit, value=12)
+        await hass.async_block_till_done()
+        kept = furnish(hass, limit)
+        bus.remove(old)
+        await wait_for_state(hass, kept.limit, "unavailable")
+        bus.add(new)
+        flow = await replaced(hass, "wrong_charger_abl1")
+        found = issue(hass, "wrong_charger_abl1")
+        assert found is not None
+        assert found.translation_placeholders is not None
+        # As the user has named it.
+        assert found.translation_placeholders["charger"] == "Family's"
+        assert flow.step == "confirm"
+        assert flow.tells("2W22xy00000009", old.serial, "It starts with 6 A")
+        assert not new.writes
+        await flow.submit()
+        assert flow.result["type"] is FlowResultType.CREATE_ENTRY
+        await wait_for_state(hass, kept.limit, "6.0")
+        await bus.wait_for_async(lambda: new.ic_amps <= 6)
+        await all_there(hass, kept)
+        [subentry] = entry.subentries.values()
+        assert subentry.unique_id == identity(entry) == "abl_2W22xy00000009"
+        assert subentry.data["address"] == 1
+        assert not issues(hass)
+
+
+async def test_a_wrong_chargepoint_and_a_wrong_ews_box_are_accepted(
+    hass: HomeAssistant,
+) -> None:
+    old = EvboxChargePoint(1923054, 1, min_interval=0)
+    with VirtualBus.in_loop(old) as bus:
+        # Addressed as "whoever is there": that stays.
+        anyone = stored_charger("evbox", 0, poll_interval=0.5)
+        entry = await setup_bus(hass, "evbox", bus.url, anyone)
+        status = await get_entity(hass, "sensor", entry, "maximum_current")
+        await wait_until(hass, lambda: entry.subentries["evbox0"].data["serial"])
+        old.serial = "00000777"
+        flow = await replaced(hass, "wrong_charger_evbox0")
+        await flow.submit()
+        stored = entry.subentries["evbox0"].data
+        assert (stored["address"], stored["serial"]) == (0, "777")
+        await wait_for_state(hass, status, "35.0")
+        assert identity(entry) == "evbox_777"
+        await hass.config_entries.async_remove(entry.entry_id)
+
+    async with running(hass, EwsBox(), title="Charger") as (entry, bus):
+        status = await get_entity(hass, "sensor", entry, "2_status")
+        box = EwsBox(serial="000000000077")
+        bus.unplug()
+        await wait_for_state(hass, status, "unavailable")
+        [before] = bus.devices
+        bus.remove(before)
+        bus.add(box)
+        bus.replug()
+        flow = await replaced(hass, "wrong_charger_ews01_1")
+        await flow.submit()
+        await wait_for_state(hass, status, "available")
+        assert identity(entry) == "ews_000000000077"
+        await bus.wait_for_async(lambda: [one.limit for one in box.ports] == [6, 6])
+        assert not issues(hass)
+
+
+async def test_swapped_boxes_have_not_replaced_each_other(hass: HomeAssistant) -> None:
+    one, two = AblBox(1), AblBox(2, serial="2W22xy00000002")
+    async with running(hass, one, two) as (entry, bus):
+        for index in (0, 1):
+            await get_entity(hass, "sensor", entry, "1_status", index=index)
+        bus.unplug()
+        one.device_id, two.device_id = 2, 1
+        bus.replug()
+        await wait_until(hass, lambda: len(issues(hass)) == 2)
+        await hass.async_block_till_done()
+        for key, other in (("abl1", "Charger 2"), ("abl2", "Charger 1")):
+            found = issue(hass, f"wrong_charger_{key}")
+            assert found is not None
+            assert found.translation_key == "wrong_charger"
+            assert found.translation_placeholders is not None
+            assert found.translation_placeholders["other"] == f"{other} (Bus)"
+            assert not found.is_fixable
+        # One of them is removed, so its box is free to take the other's place.
+        hass.config_entries.async_remove_subentry(entry, "abl2")
+        await hass.async_block_till_done()
+        flow = await Flow.repair(hass, "wrong_charger_abl1")
+        assert flow.tells(two.serial)
+
+
+@pytest.mark.parametrize("meanwhile", ["removed", "added elsewhere"])
+async def test_a_repair_that_no_longer_makes_sense(
+    hass: HomeAssistant, meanwhile: str
+) -> None:
+    box = AblBox(1)
+    async with running(hass, box) as (entry, bus):
+        await get_entity(hass, "sensor", entry, "1_status")
+        bus.unplug()
+        box.serial = "2W22xy00000009"
+        bus.replug()
+        flow = await replaced(hass, "wrong_charger_abl1")
+        reason = "charger_gone"
+        if meanwhile == "removed":
+            hass.config_entries.async_remove_subentry(entry, "abl1")
+        else:
+            other = stored_charger("abl", 7, serial=box.serial, title="Other")
+            bus_entry("abl", NOWHERE, other, entry_id="other").add_to_hass(hass)
+            reason = "box_already_set_up"
+        await flow.submit()
+        assert flow.result["reason"] == reason
 
 
 # -- Set up twice ------------------------------------------------------------------------

@@ -220,10 +220,10 @@ async def test_a_charger_is_added_and_reconfigured(hass: HomeAssistant) -> None:
         await bus.wait_for_async(lambda: two.lamp == 40)
 
         subentry = entry.subentries["sextant3"]
-        flow = await Flow.change_charger(hass, entry, subentry)
+        flow = await Flow.change_settings(hass, entry, subentry)
         assert fields(flow)["dial"] == "3"
         assert fields(flow)["expert"]["lamp"] == 55
-        typed = {"name": "Garage", "installation_limit": 13, "serial": SERIAL}
+        typed = {"name": "Garage", "installation_limit": 13}
         await flow.submit({**typed, "dial": "8", "expert": {}})
         assert flow.errors == {"dial": "address_taken"}
         await flow.submit({**typed, "dial": "3", "expert": {"lamp": 5}})

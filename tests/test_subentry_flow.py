@@ -254,7 +254,6 @@ def changed(**more: object) -> dict[str, Any]:
     return {
         "name": "Box",
         "device_id": "1",
-        "serial": serial(1),
         "installation_limit": 16,
         "expert": {"poll_interval": 0.2, "voltage": 230, "phase_order": "123"},
     } | more
@@ -266,13 +265,12 @@ async def test_abl_charger_is_changed_in_place(hass: HomeAssistant) -> None:
         one = get(entry, "Charger 1")
         flow = await Flow.change_charger(hass, entry, one)
         assert flow.step == "change"
-        assert flow.result["menu_options"] == ["settings", "new_address"]
+        assert flow.result["menu_options"] == ["settings", "new_address", "replace"]
         await flow.choose("settings")
         assert flow.step == "reconfigure"
         assert fields(flow) == {
             "name": "Charger 1",
             "device_id": "1",
-            "serial": serial(1),
             "installation_limit": 16,
             "expert": {
                 "poll_interval": 0.1,
@@ -283,8 +281,6 @@ async def test_abl_charger_is_changed_in_place(hass: HomeAssistant) -> None:
         }
         await flow.submit(changed(device_id="2"))
         assert flow.errors == {"device_id": "address_taken"}
-        await flow.submit(changed(serial=f" {serial(2)} "))
-        assert flow.errors == {"base": "box_already_set_up"}
         await flow.submit(changed(name=" ", installation_limit="nan"))
         assert flow.errors == {
             "name": "name_empty",
@@ -331,23 +327,40 @@ async def test_abl_charger_is_changed_in_place(hass: HomeAssistant) -> None:
         await take_down(hass, entry)
 
 
-async def test_replaced_abl_box_is_taken_after_its_serial_number_is_emptied(
+async def test_serial_number_can_be_typed_as_long_as_it_is_not_known(
     hass: HomeAssistant,
 ) -> None:
+    beside = stored_charger("abl", 2, serial=serial(2), title="Beside")
+    entry = await setup_bus(hass, "abl", NOWHERE, stored_charger("abl", 1), beside)
+    flow = await Flow.change_settings(hass, entry, get(entry, "Charger 1"))
+    await flow.submit(changed(serial=f" {serial(2)} "))
+    assert flow.errors == {"base": "box_already_set_up"}
+    assert flow.tells("Beside (Bus)")
+    await flow.submit(changed(serial=f" {serial(1)} "))
+    assert flow.result["reason"] == "reconfigure_successful"
+    box = get(entry, "Box")
+    assert box.data["serial"] == serial(1)
+    # Its entities stay what they are.
+    assert "identity" not in box.data
+    assert box.unique_id is None
+    flow = await Flow.change_settings(hass, entry, box)
+    assert "serial" not in fields(flow)
+
+
+async def test_abl_box_is_replaced_by_whichever_answers(hass: HomeAssistant) -> None:
     entry = await setup_bus(
         hass, "abl", NOWHERE, stored_charger("abl", 1, serial=serial(1))
     )
-    flow = await Flow.change_charger(hass, entry, get(entry, "Charger 1"))
-    typed = changed(device_id="4")
-    del typed["serial"]
-    await flow.submit(typed)
+    flow = await Flow.replace_charger(hass, entry, get(entry, "Charger 1"))
+    await flow.submit({"serial": serial(1)})
+    assert flow.errors == {"serial": "same_box"}
+    await flow.submit({})
     assert flow.result["reason"] == "reconfigure_successful"
-    box = get(entry, "Box")
-    assert "serial" not in fields(await Flow.change_charger(hass, entry, box))
-    assert box.data["serial"] is None
-    assert box.data["address"] == 4
+    box = get(entry, "Charger 1")
+    assert (box.data["serial"], box.data["address"]) == (None, 1)
+    assert box.unique_id is None
     # Another box, of which nothing is known yet.
-    assert box.unique_id == box.data["identity"] != f"abl_{serial(1)}"
+    assert box.data["identity"] not in (f"abl_{serial(1)}", box.subentry_id)
 
 
 async def test_lower_limit_takes_the_fail_safe_current_with_it(
@@ -357,26 +370,45 @@ async def test_lower_limit_takes_the_fail_safe_current_with_it(
         "evbox", 42, serial="42", title="Box", fail_safe_current=10.0
     )
     entry = await setup_bus(hass, "evbox", NOWHERE, known)
-    flow = await Flow.change_charger(hass, entry, get(entry, "Box"))
+    flow = await Flow.change_settings(hass, entry, get(entry, "Box"))
     offered = fields(flow)
-    assert offered["serial_number"] == "00000042"
+    assert "serial_number" not in offered
     assert offered["expert"]["command"] == "68"
     assert offered["expert"]["information"] == "00" * 16
     await flow.submit(
         {
             "name": "Box",
-            "serial_number": "43",
             "installation_limit": 8,
             "expert": {"command": "69", "information": "FF" * 16},
         }
     )
     assert flow.result["reason"] == "reconfigure_successful"
     box = get(entry, "Box")
-    assert box.unique_id == "evbox_43"
-    assert box.data["address"] == 43
-    assert box.data["serial"] == "43"
+    assert box.unique_id == "evbox_42"
+    assert box.data["address"] == 42
+    assert box.data["serial"] == "42"
     assert box.data["installation_limit"] == 8
     assert box.data["fail_safe_current"] == 8
     assert box.data["fail_safe_timeout"] == 60
     assert box.data["command"] == 69
     assert box.data["information"] == "FF" * 16
+
+
+async def test_evbox_is_replaced_by_another_serial_number(hass: HomeAssistant) -> None:
+    beside = stored_charger("evbox", 7, serial="7", title="Beside")
+    known = stored_charger("evbox", 42, serial="42", title="Box")
+    entry = await setup_bus(hass, "evbox", NOWHERE, known, beside)
+    flow = await Flow.replace_charger(hass, entry, get(entry, "Box"))
+    for wrong, error in (
+        ("7", "address_taken"),
+        ("42", "same_box"),
+        ("0", "any_not_alone"),
+        ("x", "bad_serial_number"),
+    ):
+        await flow.submit({"serial_number": wrong})
+        assert flow.errors == {"serial_number": error}
+    await flow.submit({"serial_number": "00000043"})
+    assert flow.result["reason"] == "reconfigure_successful"
+    box = get(entry, "Box")
+    assert box.unique_id == box.data["identity"] == "evbox_43"
+    assert (box.data["address"], box.data["serial"]) == (43, "43")

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from homeassistant.config_entries import ConfigEntryState, ConfigSubentry
+from homeassistant.config_entries import ConfigSubentry
 from homeassistant.data_entry_flow import FlowResultType
 from homeassistant.helpers import (
     device_registry as dr,
@@ -52,8 +52,7 @@ def get(entry: MockConfigEntry, title: str) -> ConfigSubentry:
 
 def changed(name: str, *limits: float, **more: object) -> dict[str, Any]:
     """Return what is typed to change a box; its fail-safe is an entity by now."""
-    typed = {"box_serial": SERIAL, "expert": FAST, **more}
-    typed = typed_box(name, *limits, **typed)
+    typed = typed_box(name, *limits, **{"expert": FAST, **more})
     del typed["fail_safe_current"]
     return typed
 
@@ -62,7 +61,7 @@ async def change(
     hass: HomeAssistant, entry: MockConfigEntry, typed: dict[str, Any]
 ) -> None:
     [box] = entry.subentries.values()
-    flow = await Flow.change_charger(hass, entry, box)
+    flow = await Flow.change_settings(hass, entry, box)
     await flow.submit(typed)
     assert flow.result["reason"] == "reconfigure_successful", flow.errors
     await hass.async_block_till_done()
@@ -207,19 +206,16 @@ async def test_name_and_limits_are_changed_in_place(hass: HomeAssistant) -> None
             }
 
             [stored] = entry.subentries.values()
-            flow = await Flow.change_charger(hass, entry, stored)
+            flow = await Flow.change_settings(hass, entry, stored)
             assert flow.step == "reconfigure_box"
             assert fields(flow) == {
                 "name": "Yard",
-                "box_serial": SERIAL,
                 "ports": "2",
                 "installation_limit": 16,
                 "installation_limit_2": 16,
                 "expert": {"poll_interval": 0.2},
             }
             for wrong, errors in (
-                ({"box_serial": "-"}, {"box_serial": "bad_box_serial"}),
-                ({"box_serial": ""}, {"box_serial": "no_address"}),
                 ({"name": " "}, {"name": "name_empty"}),
                 (
                     {"installation_limit_2": "nan"},
@@ -282,7 +278,7 @@ async def test_second_port_goes_and_comes_back(hass: HomeAssistant) -> None:
             assert state_of(hass, numbers[0]) == "11.0"
             assert port_device(hass, entry, 1) == one_device
             assert dialler.attempts == 1
-            flow = await Flow.change_charger(hass, entry, stored)
+            flow = await Flow.change_settings(hass, entry, stored)
             assert fields(flow)["ports"] == "1"
             # There is no limit of a port that is not used.
             assert "installation_limit_2" not in fields(flow)
@@ -303,16 +299,29 @@ async def test_second_port_goes_and_comes_back(hass: HomeAssistant) -> None:
             assert not ir.async_get(hass).issues
 
 
-async def test_another_serial_number_is_another_box(hass: HomeAssistant) -> None:
+async def test_box_is_replaced_by_one_that_has_dialled(hass: HomeAssistant) -> None:
     old, new = EwsBox(serial=SERIAL), EwsBox(serial=OTHER)
     async with listening(hass, stored_box(SERIAL, poll_interval=0.2)) as entry:
         with dialling(entry, old), dialling(entry, new):
             status = await get_entity(hass, "sensor", entry, "1_status")
             await offered(hass, OTHER)
-            await change(hass, entry, changed("Yard", 16, 16, box_serial=OTHER))
+            flow = await Flow.replace_charger(hass, entry, get(entry, "Yard"))
+            assert flow.tells(SERIAL, "It starts with 6 A")
+            for wrong, error in (
+                ("-", "bad_box_serial"),
+                ("", "no_address"),
+                (SERIAL, "same_box"),
+            ):
+                await flow.submit({"box_serial": wrong})
+                assert flow.errors == {"box_serial": error}
+            await flow.submit({"box_serial": OTHER})
+            assert flow.result["reason"] == "reconfigure_successful"
+            await hass.async_block_till_done()
             [stored] = entry.subentries.values()
-            assert stored.unique_id == f"ews_{OTHER}"
+            assert stored.title == "Yard"
+            assert stored.unique_id == stored.data["identity"] == f"ews_{OTHER}"
             assert (stored.data["address"], stored.data["serial"]) == (OTHER, OTHER)
+            assert stored.data["poll_interval"] == 0.2
             # The new one is no longer offered, and the old one is.
             await offered(hass, SERIAL)
             await wait_until(hass, lambda: list(offers(hass)) == [f"EWS-Box {SERIAL}"])
@@ -328,16 +337,32 @@ async def test_serial_number_of_another_box_is_refused(hass: HomeAssistant) -> N
     elsewhere.add_to_hass(hass)
     boxes = [stored_box(SERIAL), {**stored_box(OTHER), "title": "Other"}]
     async with listening(hass, *boxes) as entry:
-        flow = await Flow.change_charger(hass, entry, get(entry, "Yard"))
-        await flow.submit(changed("Yard", 16, box_serial=OTHER))
+        flow = await Flow.replace_charger(hass, entry, get(entry, "Yard"))
+        await flow.submit({"box_serial": OTHER})
         assert flow.errors == {"box_serial": "address_taken"}
-        await flow.submit(changed("Yard", 16, box_serial="AB"))
-        assert flow.errors == {"base": "box_already_set_up"}
-        # Its own is nobody else's.
-        await flow.submit(changed("Yard", 16))
+        await flow.submit({"box_serial": "AB"})
+        assert flow.errors == {"box_serial": "box_already_set_up"}
+        assert flow.tells("Yard (Bus)")
+        flow.abort()
+
+
+async def test_box_on_a_serial_line_is_replaced_by_whichever_answers(
+    hass: HomeAssistant,
+) -> None:
+    old, new = EwsBox(serial=SERIAL), EwsBox(serial=OTHER)
+    async with running(hass, old) as (entry, bus):
+        status = await get_entity(hass, "sensor", entry, "2_status")
+        bus.remove(old)
+        flow = await Flow.replace_charger(hass, entry, get(entry, "Yard"))
+        await flow.submit({})
         assert flow.result["reason"] == "reconfigure_successful"
-        await hass.async_block_till_done()
-        assert entry.state is ConfigEntryState.LOADED
+        [stored] = entry.subentries.values()
+        assert (stored.data["address"], stored.data["serial"]) == ("", None)
+        assert stored.unique_id is None
+        assert stored.data["identity"] not in (f"ews_{SERIAL}", stored.subentry_id)
+        bus.add(new)
+        await wait_for_state(hass, status, "available")
+        await wait_until(hass, lambda: stored.data["serial"] == OTHER)
 
 
 async def test_box_that_is_removed_is_a_stranger(hass: HomeAssistant) -> None:

@@ -228,16 +228,15 @@ async def test_polled_box_is_changed_in_place(hass: HomeAssistant) -> None:
     with VirtualBus.in_loop(box) as bus:
         stored = stored_charger("smartevse", 1, serial="4711", title="Box")
         entry = await setup_bus(hass, "smartevse", bus.url, stored)
-        flow = await Flow.change_charger(hass, entry, get(entry, "Box"))
+        flow = await Flow.change_settings(hass, entry, get(entry, "Box"))
         offered = fields(flow)
         assert offered["unit"] == "1"
-        assert offered["serial"] == "4711"
+        assert "serial" not in offered
         assert offered["stop_on_shutdown"] is False
         assert "order_lifetime" not in offered
         typed = {
             "name": "Car port",
             "unit": "1",
-            "serial": "4711",
             "installation_limit": 10,
             "order_lifetime": 20,
             "stop_on_shutdown": True,
@@ -260,7 +259,7 @@ async def test_polled_box_is_changed_in_place(hass: HomeAssistant) -> None:
         assert running.config.stop_on_shutdown is True
         assert bus.opened == 1
 
-        flow = await Flow.change_charger(hass, entry, changed)
+        flow = await Flow.change_settings(hass, entry, changed)
         offered = fields(flow)
         assert offered["order_lifetime"] == 20
         assert offered["stop_on_shutdown"] is True
@@ -272,7 +271,7 @@ async def test_slave_is_changed_in_place(hass: HomeAssistant) -> None:
     first, second = slave(2), slave(3)
     with VirtualBus.in_loop(first, second) as bus:
         entry = await master_bus(hass, bus.url, 2, 3)
-        flow = await Flow.change_charger(hass, entry, get(entry, "Charger 3"))
+        flow = await Flow.change_settings(hass, entry, get(entry, "Charger 3"))
         assert fields(flow)["slave"] == "3"
         assert "serial" not in flow.result["data_schema"].schema
         typed = {

@@ -206,7 +206,8 @@ def test_pure_parts_of_a_protocol_do_not_talk() -> None:
 def test_the_coordinator_does_not_know_what_stands_on_it() -> None:
     above = {
         *("binary_sensor", "button", "event", "number", "select", "sensor", "switch"),
-        *("entity", "diagnostics", "services", "actions", "config_flow", "flows"),
+        *("entity", "diagnostics", "services", "repairs", "actions", "config_flow"),
+        "flows",
     }
     for name in (
         *("coordinator", "connections", "devices", "discovery", "issues"),

@@ -31,6 +31,10 @@ Its own address is stored under homeassistant.const.CONF_HOST and CONF_PORT.
 # Its address is stored under homeassistant.const.CONF_ADDRESS; for a box that is alone
 # on its bus that is the serial number, if known.
 
+CONF_ENTRY: Final = "entry_id"
+CONF_SUBENTRY: Final = "subentry_id"
+"""Ids in the data of discovery and repair flows."""
+
 SUBENTRY_CHARGER: Final = "charger"
 
 CONF_IDENTITY: Final = "identity"

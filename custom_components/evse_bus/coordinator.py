@@ -41,7 +41,7 @@ from .discovery import async_set_up_now, async_wants_to_connect
 from .energy import TOTALS
 from .evse.bus import Bus
 from .evse.listeners import notify
-from .evse.model import ChargerConfig, Circuit, Orders
+from .evse.model import ChargerConfig, Circuit, Fault, Orders
 from .evse.safety import cautious
 from .identity import Holder, identity_of, older_holder, stands_on_serial
 from .issues import NOT_STORED, BusIssues
@@ -218,17 +218,16 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
                 await self._async_remove_charger(self.chargers[key])
             self._duplicates = self._find_duplicates()
             self.issues.set_up_twice(self._duplicates)
-            for key, (subentry, _) in tuple(configured.items()):
-                if subentry.subentry_id in self._duplicates:
-                    del configured[key]
-                    if (other := self.chargers.get(key)) is not None:
-                        await self._async_take_off(other)
+            # All ports of a box together, before the first one of another box.
+            for one in tuple(self.chargers.values()):
+                if one.subentry_id in self._duplicates or one.identity != identity_of(
+                    configured[one.key][0]
+                ):
+                    await self._async_take_off(one)
             for key, (subentry, config) in configured.items():
-                managed = self.chargers.get(key)
-                if managed and managed.identity != identity_of(subentry):
-                    await self._async_take_off(managed)
-                    managed = None
-                if managed is None:
+                if subentry.subentry_id in self._duplicates:
+                    continue
+                if (managed := self.chargers.get(key)) is None:
                     await self._async_add_charger(subentry, config)
                 else:
                     await self._async_change_charger(managed, subentry, config)
@@ -248,7 +247,13 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         self, _change: ConfigEntryChange, entry: EvseBusConfigEntry
     ) -> None:
         """Follow another entry that has added, removed or identified a box."""
-        if entry.domain == DOMAIN and self._find_duplicates() != self._duplicates:
+        if entry.domain != DOMAIN:
+            return
+        for managed in self.chargers.values():
+            if Fault.WRONG_CHARGER in managed.charger.noticed:
+                # Where the wrong box is set up may have changed.
+                self.issues.check(managed)
+        if self._find_duplicates() != self._duplicates:
             self.config_entry.async_create_task(
                 self.hass,
                 self._async_follow(entry),
@@ -523,6 +528,17 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
     def _add_entities(self, managed: ManagedCharger) -> None:
         for add_entities in self._platforms:
             add_entities(managed)
+
+    def other_serial(self, subentry_id: str) -> str | None:
+        """Return the serial number of a wrong box that answers in a charger's place."""
+        for managed in self.chargers.values():
+            charger = managed.charger
+            if (
+                managed.subentry_id == subentry_id
+                and Fault.WRONG_CHARGER in charger.noticed
+            ):
+                return charger.other_serial
+        return None
 
     def remove_device(self, identifiers: set[str]) -> bool:
         """Return whether a device may be removed: only that of a missing connector."""

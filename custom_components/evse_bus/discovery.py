@@ -15,7 +15,7 @@ from homeassistant.helpers.dispatcher import async_dispatcher_connect
 from homeassistant.helpers.start import async_at_started
 
 from .configuration import protocol_of
-from .const import CONF_PROTOCOL, DOMAIN
+from .const import CONF_ENTRY, CONF_PROTOCOL, DOMAIN
 from .identity import holder
 
 if TYPE_CHECKING:
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
     from .evse.dialling import Listener, UnknownBox
 
-CONF_ENTRY: Final = "entry_id"
 CONF_BOX: Final = "box"
 
 MOST_OFFERS: Final = 16

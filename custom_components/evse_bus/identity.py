@@ -6,12 +6,13 @@ added again, at whatever port and in whatever way, finds all of them again; else
 id of its subentry. A serial number that is read later does not change it.
 """
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict
 
+from homeassistant.const import CONF_ADDRESS
 from homeassistant.core import callback
 from homeassistant.util.ulid import ulid_now
 
-from .configuration import protocol_of
+from .configuration import charger_configs, initial_orders, protocol_of
 from .const import CONF_IDENTITY, CONF_PROTOCOL, CONF_SERIAL, DOMAIN
 
 if TYPE_CHECKING:
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from homeassistant.core import HomeAssistant
 
     from .evse.protocol import Protocol
+    from .evse.scan import Address
 
 
 def identity_data(protocol: Protocol, serial: str | None) -> dict[str, str]:
@@ -27,9 +29,37 @@ def identity_data(protocol: Protocol, serial: str | None) -> dict[str, str]:
     return {} if identity is None else {CONF_IDENTITY: identity}
 
 
-def another_identity(protocol: Protocol, serial: str | None) -> dict[str, str]:
-    """Return the identity of a box that replaces another, as part of its data."""
-    return {CONF_IDENTITY: protocol.identity(serial) or ulid_now()}
+class AnotherBox(TypedDict):
+    """What changes in a subentry whose box was replaced."""
+
+    data: dict[str, Any]
+    unique_id: str | None
+
+
+def another_box(
+    protocol: Protocol, subentry: ConfigSubentry, address: Address, serial: str | None
+) -> AnotherBox:
+    """Return the subentry of a box that takes the place of another."""
+    identity = protocol.identity(serial)
+    data = {
+        **subentry.data,
+        CONF_ADDRESS: address,
+        CONF_SERIAL: serial,
+        # Never that of the box before, of which nothing may be known either.
+        CONF_IDENTITY: identity or ulid_now(),
+    }
+    return AnotherBox(data=data, unique_id=identity)
+
+
+def another_box_texts(protocol: Protocol, subentry: ConfigSubentry) -> dict[str, str]:
+    """Return the placeholders of the texts on a box that replaces another."""
+    configs = charger_configs({CONF_PROTOCOL: protocol.key}, subentry)
+    first = max(initial_orders(subentry, one).limit.current for one in configs)
+    return {
+        "name": subentry.title,
+        "before": subentry.data.get(CONF_SERIAL) or "?",
+        "current": f"{first:g}",
+    }
 
 
 def kept_identity(subentry: ConfigSubentry) -> dict[str, str]:

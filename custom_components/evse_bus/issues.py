@@ -5,12 +5,13 @@ from typing import Final
 
 from homeassistant.config_entries import ConfigEntry
 from homeassistant.core import HomeAssistant
-from homeassistant.helpers import issue_registry as ir
+from homeassistant.helpers import device_registry as dr, issue_registry as ir
 
-from .const import DOMAIN
+from .configuration import protocol_of
+from .const import CONF_ENTRY, CONF_SERIAL, CONF_SUBENTRY, DOMAIN
 from .evse.model import Fault, Orders
 from .evse.safety import INTERVALS_PER_TIMEOUT
-from .identity import Holder
+from .identity import Holder, another_box_texts, holder
 from .managed_charger import ManagedCharger
 
 NOT_STORED: Final = "orders_not_stored"
@@ -22,11 +23,19 @@ SECOND_MASTER: Final = "second_master"
 SET_UP_TWICE: Final = "set_up_twice"
 
 WRONG_CHARGER: Final = "wrong_charger"
+REPLACED: Final = "replaced"
+"""Text of the same where the box may have been replaced by another."""
+_FIXABLE: Final = {WRONG_CHARGER: REPLACED}
+"""Texts of the issues that a flow can fix."""
 DUPLICATE_ADDRESS: Final = "duplicate_address"
 SHARED_ADDRESS: Final = "shared_address"
 NO_SUCH_PORT: Final = "no_such_port"
 UNKNOWN_FIRMWARE: Final = "unknown_firmware"
 UNSUPPORTED_FIRMWARE: Final = "unsupported_firmware"
+
+
+type Fix = dict[str, str | int | float | None]
+"""Data from which `repairs.py` makes a flow."""
 
 
 def report_orders_written(hass: HomeAssistant, error: Exception | None) -> None:
@@ -38,13 +47,18 @@ def report_orders_written(hass: HomeAssistant, error: Exception | None) -> None:
 
 
 def _create(
-    hass: HomeAssistant, issue: str, key: str, placeholders: dict[str, str]
+    hass: HomeAssistant,
+    issue: str,
+    key: str,
+    placeholders: dict[str, str],
+    fix: Fix | None = None,
 ) -> None:
     ir.async_create_issue(
         hass,
         DOMAIN,
         issue,
-        is_fixable=False,
+        data=fix,
+        is_fixable=fix is not None,
         severity=ir.IssueSeverity.ERROR,
         translation_key=key,
         translation_placeholders=placeholders,
@@ -58,7 +72,9 @@ class BusIssues:
         """Start without issues."""
         self._hass = hass
         self._entry = entry
-        self._open: dict[str, dict[str, str]] = {}
+        self._open: dict[str, tuple[str, dict[str, str]]] = {}
+        """Text and placeholders of each issue."""
+        self._protocol = protocol_of(entry.data)
 
     def orders_lost(self, managed: ManagedCharger, orders: Orders) -> None:
         """Report that a charger's stored orders are missing."""
@@ -67,7 +83,7 @@ class BusIssues:
             managed.key,
             present=True,
             placeholders={
-                "charger": managed.name,
+                "charger": self._name(managed),
                 "current": f"{orders.limit.current:g}",
             },
         )
@@ -87,7 +103,10 @@ class BusIssues:
             ENERGY_NOT_COUNTED,
             f"{number}_{managed.key}",
             present=True,
-            placeholders={"charger": managed.name, "energy": f"{energy / 1000:+.1f}"},
+            placeholders={
+                "charger": self._name(managed),
+                "energy": f"{energy / 1000:+.1f}",
+            },
         )
 
     def set_up_twice(self, duplicates: Mapping[str, Holder]) -> None:
@@ -139,10 +158,10 @@ class BusIssues:
         charger = managed.charger
         config = charger.config
         is_duplicate = Fault.DUPLICATE_ADDRESS in charger.faults
-        faults = {
+        if managed.is_primary_port:
             # Once for a box with several ports.
-            WRONG_CHARGER: Fault.WRONG_CHARGER in charger.faults
-            and managed.is_primary_port,
+            self._check_wrong_charger(managed)
+        faults = {
             NO_SUCH_PORT: Fault.NO_SUCH_PORT in charger.faults,
             DUPLICATE_ADDRESS: is_duplicate and not charger.shares_address,
             SHARED_ADDRESS: is_duplicate and charger.shares_address,
@@ -153,13 +172,48 @@ class BusIssues:
                 managed.key,
                 present=present,
                 placeholders={
-                    "charger": managed.name,
-                    "address": str(config.address),
-                    "expected": config.serial or "-",
+                    "charger": self._name(managed),
+                    "address": self._protocol.address.label(config.address),
                 },
             )
         self._check_firmware(managed)
         self._check_timeout(managed)
+
+    def _check_wrong_charger(self, managed: ManagedCharger) -> None:
+        """Report another box in the place of a charger: exchanged, or swapped."""
+        charger = managed.charger
+        present = Fault.WRONG_CHARGER in charger.noticed
+        found = charger.other_serial if present else None
+        other = holder(self._hass, self._protocol.identity(found))
+        # A box that is set up elsewhere has not replaced this one.
+        replaced = found is not None and other is None
+        self._set(
+            WRONG_CHARGER,
+            managed.key,
+            present=present,
+            placeholders={
+                **another_box_texts(self._protocol, managed.subentry),
+                "charger": self._name(managed),
+                "expected": charger.config.serial or "?",
+                "found": found or "?",
+                "other": "-" if other is None else other.name,
+            },
+            fix={
+                CONF_ENTRY: self._entry.entry_id,
+                CONF_SUBENTRY: managed.subentry_id,
+                CONF_SERIAL: found,
+            }
+            if replaced
+            else None,
+        )
+
+    def _name(self, managed: ManagedCharger) -> str:
+        """Return the name of a charger: that of its device, if the user gave it one."""
+        device = dr.async_get(self._hass).async_get(managed.device_id)
+        given = device.name_by_user if device is not None else None
+        if given is None:
+            return managed.name
+        return given if managed.port_count == 1 else f"{given} {managed.port_number}"
 
     def _check_firmware(self, managed: ManagedCharger) -> None:
         """Report a firmware that is unknown, or that this protocol does not support."""
@@ -172,8 +226,7 @@ class BusIssues:
                 managed.key,
                 present=present and (key == UNKNOWN_FIRMWARE) == (firmware is None),
                 placeholders={
-                    "charger": managed.name,
-                    "address": str(charger.config.address),
+                    "charger": self._name(managed),
                     "firmware": firmware or "-",
                 },
             )
@@ -196,7 +249,7 @@ class BusIssues:
             managed.key,
             present=used > ordered,
             placeholders={
-                "charger": managed.name,
+                "charger": self._name(managed),
                 "interval": f"{interval:g}",
                 "ordered": str(ordered),
                 "used": str(used),
@@ -220,17 +273,19 @@ class BusIssues:
         *,
         present: bool,
         placeholders: dict[str, str] | None = None,
+        fix: Fix | None = None,
     ) -> None:
+        """Create, change or delete an issue; ``fix``: data of the flow that fixes it."""
         issue = f"{key}_{owner}"
         if not present:
             if issue in self._open:
                 self._delete(issue)
             return
-        shown = placeholders or {}
+        shown = (_FIXABLE[key] if fix else key, placeholders or {})
         if self._open.get(issue) == shown:
             return
         self._open[issue] = shown
-        _create(self._hass, issue, key, shown)
+        _create(self._hass, issue, *shown, fix)
 
     def _delete(self, issue: str) -> None:
         self._open.pop(issue, None)

@@ -19,6 +19,7 @@ from .errors import (
     LineError,
     LineLostError,
     NotAvailableError,
+    WrongChargerError,
 )
 from .exchange import Turn, Wire
 from .framing import Frame, Framer, Timing
@@ -373,6 +374,8 @@ class Bus(Observable):
             charger.plan(self.now)
         except EvseError as error:
             _LOGGER.debug("%s: %s", charger.config.name, error)
+            if isinstance(error, WrongChargerError):
+                charger.on_wrong_charger(error.found)
             charger.on_missed(self.now, str(error))
         except Exception as error:
             # A mistake of ours must not end the bus for all other chargers.

@@ -126,6 +126,8 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         self._pause_watch = PauseWatch()
         self.noticed: frozenset[Fault] = frozenset()
         """Faults found by this library, beside those the charger reports."""
+        self.other_serial: str | None = None
+        """Serial number of the last wrong box in its place (`Fault.WRONG_CHARGER`)."""
         self.orders_expired = False
         """The orders were not renewed within their lifetime: the fail-safe counts."""
         self.commit: Callable[[Orders], Awaitable[None]] = _no_commit
@@ -369,6 +371,12 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
             pause = min(self.timing.backoff * doubled, self.timing.backoff_limit)
             self.set_unavailable(why)
         self.slot.ready = self.slot.due = now + max(pause, self.minimum_pause(now))
+
+    def on_wrong_charger(self, serial: str | None) -> None:
+        """Take note of the serial number of the box that answers in its place."""
+        if serial != self.other_serial:
+            self.other_serial = serial
+            self.updated()
 
     def minimum_pause(self, now: float) -> float:  # noqa: ARG002
         """Return the time for which nothing may be sent to it from now on, s."""

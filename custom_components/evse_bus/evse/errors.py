@@ -79,8 +79,10 @@ class ImplausibleReplyError(ExchangeError):
 class WrongChargerError(EvseError):
     """Another charger answers at this address; nothing was written."""
 
-    def __init__(self, message: str, *, expected: str | None, found: str) -> None:
-        """Keep both identities for the message to the user."""
+    def __init__(
+        self, message: str, *, expected: str | None, found: str | None
+    ) -> None:
+        """Keep both serial numbers; ``found`` is ``None`` for a box that has none."""
         super().__init__(message)
         self.expected = expected
         self.found = found
@@ -88,7 +90,7 @@ class WrongChargerError(EvseError):
     @property
     @override
     def details(self) -> dict[str, str]:
-        return {"expected": self.expected or "-", "found": self.found}
+        return {"expected": self.expected or "-", "found": self.found or "-"}
 
 
 class DuplicateAddressError(EvseError):

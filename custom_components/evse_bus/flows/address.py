@@ -13,6 +13,7 @@ from homeassistant.helpers.selector import (
 )
 import probatio as vol
 
+from ..const import CONF_SERIAL
 from ..evse.address import NumberAddress
 
 if TYPE_CHECKING:
@@ -67,6 +68,19 @@ def manual_form(
         return vol.Schema({vol.Required(form.key): chosen})
     key = form.plural if multiple else form.key
     return vol.Schema({vol.Required(key): address_field(form, multiple=multiple)})
+
+
+def another_form(form: AddressForm, *, known: Iterable[str] = ()) -> vol.Schema:
+    """Return the form for the serial number of a box that replaces another.
+
+    ``known``: as in `manual_form`.
+    """
+    if not form.is_serial:
+        field = {vol.Optional(CONF_SERIAL): TextSelector()} if form.has_serial else {}
+        return vol.Schema(field)
+    if form.optional:
+        return vol.Schema({vol.Optional(form.key): address_field(form)})
+    return manual_form(form, multiple=False, known=known)
 
 
 def typed_addresses(

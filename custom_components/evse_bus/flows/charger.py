@@ -121,20 +121,25 @@ def default_name(protocol: Protocol, address: Address) -> str:
 
 
 def charger_form(
-    protocol: Protocol, *, ask_address: bool = False, new: bool = True
+    protocol: Protocol,
+    *,
+    ask_address: bool = False,
+    ask_serial: bool = False,
+    new: bool = True,
 ) -> vol.Schema:
     """Return the form for a charger: name, limits, and a section with the rest.
 
-    ``ask_address``: also its address and serial number. The fail-safe values are asked
-    for only when a charger is added; later they are entities.
+    ``ask_address``, ``ask_serial``: also these; where the address is the serial number,
+    ``ask_serial`` counts. The fail-safe values are asked for only when a charger
+    is added; later they are entities.
     """
     address = protocol.address
     form: dict[vol.Marker, object] = {vol.Required(CONF_NAME): TextSelector()}
-    if ask_address:
+    if ask_serial if address.is_serial else ask_address:
         marker = vol.Optional if address.optional else vol.Required
         form[marker(address.key)] = address_field(address)
-        if address.has_serial and not address.is_serial:
-            form[vol.Optional(CONF_SERIAL)] = TextSelector()
+    if ask_serial and address.has_serial and not address.is_serial:
+        form[vol.Optional(CONF_SERIAL)] = TextSelector()
     if protocol.ports > 1:
         counts = tuple(str(count) for count in range(1, protocol.ports + 1))
         form[vol.Required(CONF_PORTS, default=counts[-1])] = dropdown(

@@ -38,6 +38,7 @@ from ..configuration import protocol_of
 from ..connections import ListenerConnections, address_name
 from ..const import (
     CONF_ALLOWED,
+    CONF_ENTRY,
     CONF_PROTOCOL,
     CONF_SERIAL,
     DOMAIN,
@@ -45,7 +46,7 @@ from ..const import (
     SUBENTRY_CHARGER,
 )
 from ..coordinator import EvseBusConfigEntry
-from ..discovery import CONF_BOX, CONF_ENTRY
+from ..discovery import CONF_BOX
 from ..evse.errors import (
     EvseError,
     LineError,

@@ -349,7 +349,7 @@ class ChargerSteps[
             step_id="charger" if self.protocol.ports == 1 else "box",
             data_schema=self.add_suggested_values_to_schema(
                 charger_form(
-                    self.protocol, ask_address=candidate.address == address.any
+                    self.protocol, ask_serial=candidate.address == address.any
                 ),
                 user_input or offered,
             ),

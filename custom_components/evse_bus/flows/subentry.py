@@ -19,15 +19,14 @@ from ..connections import Connections, ListenerConnections
 from ..const import (
     CONF_FAIL_SAFE_CURRENT,
     CONF_FAIL_SAFE_TIMEOUT,
-    CONF_IDENTITY,
     CONF_INSTALLATION_LIMIT,
     CONF_SERIAL,
     SUBENTRY_CHARGER,
 )
 from ..evse.errors import NotAvailableError
 from ..evse.scan import Address, ScanResult
-from ..identity import another_identity, kept_identity
-from .address import Errors, typed_addresses
+from ..identity import another_box, another_box_texts, kept_identity
+from .address import Errors, another_form, typed_addresses
 from .charger import (
     charger_data,
     charger_form,
@@ -158,40 +157,39 @@ class ChargerSubentryFlow(
         entry = self._get_entry()
         subentry = self._get_reconfigure_subentry()
         self.protocol = protocol_of(entry.data)
-        if user_input is None and not self._settings and self._can_change_address():
+        if user_input is None and not self._settings:
+            new_address = ["new_address"] if self._can_change_address() else []
             return self.async_show_menu(
                 step_id="change",
-                menu_options=["settings", "new_address"],
+                menu_options=["settings", *new_address, "replace"],
                 description_placeholders={"name": subentry.title},
             )
+        stored = subentry.data
+        known: str | None = stored.get(CONF_SERIAL)
         errors: Errors = {}
         if user_input is not None:
-            form = self.protocol.address
-            addresses, errors = typed_addresses(form, user_input, self.taken())
-            others = self.others()
-            errors |= check_charger(
-                self.protocol, user_input, [one.data for one in others]
-            )
+            asked = known is None or not self.protocol.address.is_serial
+            address, errors = self._address(subentry, user_input, asked=asked)
+            others = [one.data for one in self.others()]
+            errors |= check_charger(self.protocol, user_input, others)
+            serial = known or self._typed_serial(address, user_input)
+            if not errors and known is None and self.find_holder([serial], subentry):
+                errors["base"] = "box_already_set_up"
             if not errors:
-                [address] = addresses
-                serial = self._serial(address, user_input)
-                if self.find_holder([serial], but=subentry):
-                    errors["base"] = "box_already_set_up"
-                else:
-                    data = charger_data(self.protocol, address, serial, user_input)
-                    identity = self._identity(subentry, serial)
-                    return self.async_update_and_abort(
-                        entry,
-                        subentry,
-                        unique_id=identity.get(CONF_IDENTITY),
-                        title=user_input[CONF_NAME].strip(),
-                        data=data | identity | _fail_safe(subentry.data, data),
-                    )
+                data = charger_data(self.protocol, address, serial, user_input)
+                return self.async_update_and_abort(
+                    entry,
+                    subentry,
+                    title=user_input[CONF_NAME].strip(),
+                    data=data | kept_identity(subentry) | _fail_safe(stored, data),
+                )
+        form = charger_form(
+            self.protocol, ask_address=True, ask_serial=known is None, new=False
+        )
         return self.async_show_form(
             step_id="reconfigure" if self.protocol.ports == 1 else "reconfigure_box",
             data_schema=self.add_suggested_values_to_schema(
-                charger_form(self.protocol, ask_address=True, new=False),
-                user_input or charger_suggestions(self.protocol, subentry),
+                form, user_input or charger_suggestions(self.protocol, subentry)
             ),
             errors=errors,
             description_placeholders={"name": subentry.title, "holder": self.held_by},
@@ -203,13 +201,6 @@ class ChargerSubentryFlow(
         """Change the same of a box with several ports, with texts of its own."""
         return await self.async_step_reconfigure(user_input)
 
-    def _identity(self, subentry: ConfigSubentry, serial: str | None) -> dict[str, str]:
-        """Return the identity: that of another box, if the serial number changes."""
-        before: str | None = subentry.data.get(CONF_SERIAL)
-        if before is None or serial == before:
-            return kept_identity(subentry)
-        return another_identity(self.protocol, serial)
-
     async def async_step_settings(
         self,
         user_input: dict[str, Any] | None = None,  # noqa: ARG002 - a step's signature
@@ -217,6 +208,69 @@ class ChargerSubentryFlow(
         """Change the configuration, not the charger itself."""
         self._settings = True
         return await self.async_step_reconfigure()
+
+    def _address(
+        self, subentry: ConfigSubentry, typed: Mapping[str, Any], *, asked: bool
+    ) -> tuple[Address, Errors]:
+        """Return the address in a form, else the present one, and the errors.
+
+        ``asked``: the form has a field for it.
+        """
+        present: Address = subentry.data[CONF_ADDRESS]
+        if not asked:
+            return present, {}
+        addresses, errors = typed_addresses(self.protocol.address, typed, self.taken())
+        return next(iter(addresses), present), errors
+
+    def _typed_serial(self, address: Address, typed: Mapping[str, Any]) -> str | None:
+        form = self.protocol.address
+        if form.is_serial:
+            return form.serial(address)
+        return typed.get(CONF_SERIAL, "").strip() or None
+
+    # -- Another box -------------------------------------------------------------
+
+    async def async_step_replace(
+        self, user_input: dict[str, Any] | None = None
+    ) -> SubentryFlowResult:
+        """Let another box take the place of one, with its names and settings."""
+        subentry = self._get_reconfigure_subentry()
+        form = self.protocol.address
+        field = form.key if form.is_serial else CONF_SERIAL
+        present = subentry.data.get(CONF_SERIAL)
+        errors: Errors = {}
+        if user_input is not None:
+            address, errors = self._address(subentry, user_input, asked=form.is_serial)
+            serial = self._typed_serial(address, user_input)
+            if not errors and serial is not None and serial == present:
+                errors[field] = "same_box"
+            if not errors and self.find_holder([serial], subentry):
+                errors[field] = "box_already_set_up"
+            if not errors:
+                change = another_box(self.protocol, subentry, address, serial)
+                return self.async_update_and_abort(
+                    self._get_entry(), subentry, **change
+                )
+        found = self._other_serial(subentry)
+        return self.async_show_form(
+            step_id="replace",
+            data_schema=self.add_suggested_values_to_schema(
+                another_form(form, known=self.waiting()),
+                user_input or ({field: found} if found else {}),
+            ),
+            errors=errors,
+            description_placeholders={
+                **another_box_texts(self.protocol, subentry),
+                "holder": self.held_by,
+            },
+        )
+
+    def _other_serial(self, subentry: ConfigSubentry) -> str | None:
+        """Return the serial number of the box that answers in a charger's place."""
+        entry: EvseBusConfigEntry = self._get_entry()
+        if entry.state is not ConfigEntryState.LOADED:
+            return None
+        return entry.runtime_data.other_serial(subentry.subentry_id)
 
     # -- Another address, over the wire ------------------------------------------
 
@@ -267,12 +321,6 @@ class ChargerSubentryFlow(
         subentry = self._get_entry().subentries.get(own or "")
         used = super().used_addresses()
         return used if subentry is None else used | {subentry.data[CONF_ADDRESS]}
-
-    def _serial(self, address: Address, typed: dict[str, Any]) -> str | None:
-        form = self.protocol.address
-        if form.is_serial:
-            return form.serial(address)
-        return typed.get(CONF_SERIAL, "").strip() or None
 
 
 def _fail_safe(stored: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:

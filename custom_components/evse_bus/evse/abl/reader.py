@@ -211,7 +211,7 @@ class AblReader(Charger[AblConfig]):
             found = serial or "no serial number"
             message = f"found {found} at device-ID {address}, expected {expected}"
             self.set_unavailable(message)
-            raise WrongChargerError(message, expected=expected, found=found)
+            raise WrongChargerError(message, expected=expected, found=serial)
         self.notice(Fault.WRONG_CHARGER, present=False)
         if self._doubted:
             await self._require_alone(turn, serial)

@@ -58,6 +58,9 @@ class BoxPorts(ChargerGroup):
     @override
     def removed(self, charger: Charger) -> None:
         self._ports = [one for one in self._ports if one is not charger]
+        if not self._ports:
+            # The next one may be the port of another box.
+            self.box.forget()
 
     # -- When they are polled ------------------------------------------------------
 

@@ -204,7 +204,7 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
             found = status.serial or "no serial number"
             self.set_unavailable(f"{found} answers, not {expected}")
             message = f"{self.config.name}: {found} answers, not {expected}"
-            raise WrongChargerError(message, expected=expected, found=found)
+            raise WrongChargerError(message, expected=expected, found=status.serial)
         self.notice(Fault.WRONG_CHARGER, present=False)
         self._serial = status.serial
         self.info = charger_info(self.dialect, status.serial)
