@@ -48,9 +48,10 @@ async def test_from_the_search_to_the_entry(hass: HomeAssistant) -> None:
         assert flow.result["type"] is FlowResultType.CREATE_ENTRY
         entry = flow.result["result"]
         await asyncio.sleep(1.3)
-        assert len(point.orders) == 1
+        # Two for the search.
+        assert len(point.orders) == 2
         await asyncio.sleep(2 * INTERVAL)
-        check(point, at_least=3)
+        check(point, at_least=4)
         await hass.config_entries.async_unload(entry.entry_id)
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from custom_components.evse_bus.evse.errors import LineBusyError, RefusedOrderError
 from custom_components.evse_bus.evse.evbox import PROTOCOL, EvboxConfig
+from custom_components.evse_bus.evse.evbox.scan import PROBES
 from custom_components.evse_bus.evse.model import CurrentLimit, Orders
 from custom_components.evse_bus.evse.scan import ScanResult
 from tests.simulated_time import now, simulate
@@ -15,6 +16,7 @@ from tests.virtual import EvboxChargePoint, Module
 from tests.virtual.evbox_frames import frame
 
 from .scene import ORDERS, Scene
+from .test_damaged import Damage
 
 ANY = EvboxConfig(key="scan", name="scan", address=0, installation_limit=32.0)
 CONFIRMED = Orders(
@@ -46,13 +48,80 @@ def test_the_only_box_on_the_line() -> None:
             assert one.info.serial == "1923054"
             assert (one.maximum_current, one.connectors) == (25.0, 3)
             assert (report.duplicates, report.unreadable) == ((), False)
-            assert now() - started < 1.5
-            (order,) = stage.line.orders
+            # A second reply agrees, after a minimum interval of 1 s.
+            assert now() - started < 3.5
+            assert point.counters.too_soon == 0
+            order, again = stage.line.orders
+            assert again.limits == order.limits
             assert order.serial == "00000000"
             # One phase is ordered to be off: then all of them are.
             assert order.limits == (0.0, 0.0, 0.0)
             assert order.fallback == (4.0, 4.0, 3.5)
             assert order.timeout == 120
+
+    simulate(scene())
+
+
+SERIAL = slice(6, 14)
+MAXIMUM = slice(18, 22)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        [{SERIAL: "01923055"}],
+        [{}, {SERIAL: "91923054"}],
+        [{SERIAL: "01923055"}, {MAXIMUM: "0280"}],
+        [{MAXIMUM: "0280"}],
+        [{MAXIMUM: "0280"}, {MAXIMUM: "0140"}],
+    ],
+)
+@pytest.mark.parametrize("address", [0, 1923054])
+def test_a_damaged_reply_is_no_box(
+    changes: list[dict[slice, str]], address: int
+) -> None:
+    """Its checksums match; the box is found with what two replies agree on."""
+
+    async def scene() -> None:
+        point = EvboxChargePoint(1923054, 1, max_current=25.0)
+        async with Scene.of(point) as stage:
+            Damage(stage.line).changes = list(changes)
+            report, _ = await find(stage, replace(ANY, address=address))
+            (one,) = report.found
+            assert (one.address, one.serial) == (1923054, "1923054")
+            assert one.maximum_current == 25.0
+            assert point.counters.too_soon == 0
+
+    simulate(scene())
+
+
+def test_replies_that_never_agree_are_no_box() -> None:
+    async def scene() -> None:
+        async with Scene.of(EvboxChargePoint(1923054)) as stage:
+            damage = Damage(stage.line)
+            damage.changes = [{SERIAL: f"0192305{n}"} for n in range(9)]
+            report, _ = await find(stage)
+            assert (report.found, report.unreadable) == ((), True)
+            assert len(stage.line.sent) == PROBES
+
+    simulate(scene())
+
+
+@pytest.mark.parametrize(("interval", "probes"), [(20, 2), (45, 2), (90, 1)])
+def test_a_number_that_is_not_confirmed_is_not_bound(
+    interval: int, probes: int
+) -> None:
+    async def scene() -> None:
+        point = EvboxChargePoint(1923054, min_interval=interval)
+        async with Scene.of(point) as stage:
+            report, _ = await find(stage)
+            (one,) = report.found
+            assert len(stage.line.sent) == probes
+            assert point.counters.too_soon == 0
+            if probes == 1:
+                assert (one.address, one.serial) == (0, None)
+            else:
+                assert (one.address, one.serial) == (1923054, "1923054")
 
     simulate(scene())
 
@@ -72,7 +141,7 @@ def test_a_typed_serial_number_reaches_that_box_only() -> None:
         async with Scene.of(*points) as stage:
             report, _ = await find(stage, replace(ANY, address=12))
             assert [one.address for one in report.found] == [12]
-            assert [len(point.orders) for point in points] == [0, 1]
+            assert [len(point.orders) for point in points] == [0, 2]
 
     simulate(scene())
 

@@ -28,6 +28,11 @@ from .plausibility import implausible_values
 from .readings import charger_info, serial_number
 
 TRIES: Final = 2
+"""Probes of a line on which no ChargePoint replies."""
+PROBES: Final = 4
+"""Probes until two replies of each ChargePoint agree."""
+LONGEST_WAIT: Final = 60.0
+"""A ChargePoint with a longer minimum interval is not sent a second probe, s."""
 RETRY_PAUSE = UNKNOWN_INTERVAL + INTERVAL_MARGIN
 """Between two tries where no minimum interval is known, s."""
 _PROGRESS_STEP: Final = 0.5
@@ -36,12 +41,27 @@ _PROGRESS_STEP: Final = 0.5
 
 @dataclass(slots=True)
 class _Answers:
-    """Everything received after one probe."""
+    """All that was received after one probe."""
 
     replies: list[Reply] = field(default_factory=list)
     bad_frames: bool = False
     """There were unreadable frames: several at once, or a bad line."""
     noise: bool = False
+    is_over: bool = False
+    """What comes now is late, and of no use for the probe under way."""
+
+    def accept(self, config: EvboxConfig, frame: EvboxFrame) -> Reply | None:
+        """Keep a reply of an addressed ChargePoint; return it."""
+        reply = decode_reply(frame)
+        if reply is None or reply.command != config.command:
+            return None
+        if config.addressed and reply.serial != f"{config.addressed:08d}":
+            return None
+        if implausible_values(reply):
+            self.bad_frames = True
+        elif not self.is_over and reply not in self.replies:
+            self.replies.append(reply)
+        return reply
 
     @property
     def unreadable(self) -> bool:
@@ -53,12 +73,15 @@ async def scan(
 ) -> ScanResult:
     """Send these orders to the addressed ChargePoints, and return those that reply.
 
-    Takes one second with a reply, 23 s without. A ChargePoint may have received a probe
-    although its reply was unreadable, and its reaction to another one too soon is not
-    documented: so there is a minimum interval between two. After an earlier search that
-    found one, or a bus that was stopped a moment ago, its rest comes first. Raises RefusedOrderError for orders
-    that cannot be sent, and for a probe of all ChargePoints on a bus that has chargers
-    already; LineError when the line cannot be used.
+    One reply may be damaged, so each is found when two agree: after one minimum
+    interval, 1 to 20 s; without a reply the search takes 23 s. A ChargePoint may have
+    received a probe although its reply was unreadable, and its reaction to another one
+    too soon is not documented: so there is a minimum interval between two, also after
+    an earlier search, or a bus that was stopped a moment ago.
+
+    Raises RefusedOrderError for orders that cannot be sent, and for a probe of all
+    ChargePoints on a bus that has chargers already; LineError when the line cannot be
+    used.
     """
     if config.addressed == ANY_SERIAL and bus.chargers:
         message = (
@@ -70,28 +93,51 @@ async def scan(
     request = encode_request(config, setpoint_for(orders, limits, UNKNOWN_INTERVAL))
     memory = bus.line.memory.of(EvboxMemory)
     known = memory.interval(config.addressed).reported is not None
-    answers = _Answers()
-    for number in range(TRIES):
-        if number or known:
-            await _wait(memory, config, partial(_share, progress, number))
-        answers = await bus.run(partial(_probe, bus, config, request))
-        if answers.replies:
-            break
+    probes: list[_Answers] = []
+    while not _is_over(probes, memory, config):
+        if probes or known:
+            await _wait(memory, config, partial(_share, progress, len(probes)))
+        probes.append(await bus.run(partial(_probe, bus, config, request)))
+        _learn(memory, config, probes[-1])
     progress(1.0)
-    _learn(memory, config, answers)
-    return _result(config, answers)
+    return _result(config, probes)
+
+
+def _is_over(probes: list[_Answers], memory: EvboxMemory, config: EvboxConfig) -> bool:
+    """Return whether another probe would add nothing, or come too late."""
+    if not any(one.replies for one in probes):
+        return len(probes) >= TRIES
+    if len(probes) >= PROBES or _pause(memory, config) > LONGEST_WAIT:
+        return True
+    last = probes[-1].replies
+    return bool(last) and all(_agreeing(probes, reply) > 1 for reply in last)
+
+
+def _agreeing(probes: list[_Answers], reply: Reply) -> int:
+    """Return after how many probes such a reply came: identity and maximum agree."""
+    return sum(any(_key(one) == _key(reply) for one in each.replies) for each in probes)
+
+
+def _key(reply: Reply) -> tuple[object, ...]:
+    return reply.serial, reply.maximum_current, len(reply.modules)
 
 
 def _share(progress: Progress, number: int, share: float) -> None:
-    progress((number + share) / TRIES)
+    progress((number + share) / PROBES)
+
+
+def _pause(memory: EvboxMemory, config: EvboxConfig) -> float:
+    """Return the time between two probes, s."""
+    interval = memory.interval(config.addressed)
+    if interval.reported is None:
+        return RETRY_PAUSE
+    return max(interval.value, interval.reported) + INTERVAL_MARGIN
 
 
 async def _wait(memory: EvboxMemory, config: EvboxConfig, progress: Progress) -> None:
     """Wait for the rest of the minimum interval since the last request."""
     loop = asyncio.get_running_loop()
-    interval = memory.interval(config.addressed)
-    known = interval.reported is not None
-    pause = interval.value + INTERVAL_MARGIN if known else RETRY_PAUSE
+    pause = _pause(memory, config)
     ends = memory.sent_at(config.addressed) + pause
     while (left := ends - loop.time()) > 0:
         progress(1.0 - left / pause)
@@ -107,22 +153,10 @@ def _learn(memory: EvboxMemory, config: EvboxConfig, answers: _Answers) -> None:
 
 async def _probe(bus: Bus, config: EvboxConfig, request: bytes, turn: Turn) -> _Answers:
     answers = _Answers()
-
-    def collect(frame: EvboxFrame) -> None:
-        reply = decode_reply(frame)
-        if reply is None or reply.command != config.command:
-            return
-        if config.addressed and reply.serial != f"{config.addressed:08d}":
-            return
-        if implausible_values(reply):
-            answers.bad_frames = True
-        elif reply not in answers.replies:
-            answers.replies.append(reply)
-
     bad = bus.wire.statistics.bad_frames
     try:
-        # No frame ends the exchange, so that all ChargePoints have time to reply.
-        await turn.exchange(request, collect)
+        # All ChargePoints have time to reply.
+        await turn.collect(request, partial(answers.accept, config))
     except GarbledReplyError:
         if bus.wire.statistics.bad_frames > bad:
             answers.bad_frames = True
@@ -131,28 +165,51 @@ async def _probe(bus: Bus, config: EvboxConfig, request: bytes, turn: Turn) -> _
     except ReplyTimeoutError:
         pass
     finally:
+        answers.is_over = True
         if turn.sent_at is not None:
             memory = bus.line.memory.of(EvboxMemory)
             memory.sent(config.addressed, turn.sent_at)
     return answers
 
 
-def _result(config: EvboxConfig, answers: _Answers) -> ScanResult:
+def _result(config: EvboxConfig, probes: list[_Answers]) -> ScanResult:
     found: dict[int, FoundCharger] = {}
     duplicates: set[int] = set()
-    for reply in answers.replies:
+    for reply in _confirmed(probes):
         address = _address(config, reply)
         if address in found:
             duplicates.add(address)
         else:
             found[address] = _found(address, reply)
-    if answers.bad_frames and config.addressed == ANY_SERIAL:
-        duplicates.add(ANY_SERIAL)
+    received = [one for one in probes if one.replies or one.unreadable]
+    if received and all(one.bad_frames for one in received):
+        if config.addressed == ANY_SERIAL:
+            duplicates.add(ANY_SERIAL)
+    elif not found and len(probes) == 1 and received:
+        # Too long an interval for a second probe: its number is read by the charger,
+        # from two replies, before it counts.
+        found[config.address] = FoundCharger(
+            address=config.address, info=charger_info(None)
+        )
     return ScanResult(
         found=tuple(found[address] for address in sorted(found.keys() - duplicates)),
         duplicates=tuple(sorted(duplicates)),
-        unreadable=answers.unreadable,
+        unreadable=bool(received) and (not found or received[-1].unreadable),
     )
+
+
+def _confirmed(probes: list[_Answers]) -> list[Reply]:
+    """Return the replies that agree with one to another probe, the last of each."""
+    latest: dict[object, list[Reply]] = {}
+    for one in probes:
+        for key in {_key(reply) for reply in one.replies}:
+            latest[key] = [reply for reply in one.replies if _key(reply) == key]
+    return [
+        reply
+        for replies in latest.values()
+        for reply in replies
+        if _agreeing(probes, reply) > 1
+    ]
 
 
 def _address(config: EvboxConfig, reply: Reply) -> int:
