@@ -2,6 +2,7 @@
 
 import asyncio
 from dataclasses import replace
+from itertools import pairwise
 
 from hypothesis import given, settings, strategies as st
 import pytest
@@ -14,7 +15,7 @@ from custom_components.evse_bus.evse.evbox.config import (
 )
 from custom_components.evse_bus.evse.evbox.frames import EvboxFramer
 from custom_components.evse_bus.evse.memory import LineMemory
-from custom_components.evse_bus.evse.model import ChargerConfig
+from custom_components.evse_bus.evse.model import ChargerConfig, Orders
 from tests.evse.simulated_line import until
 from tests.simulated_time import now, simulate
 from tests.virtual import EvboxChargePoint
@@ -22,24 +23,29 @@ from tests.virtual import EvboxChargePoint
 from .scene import ORDERS, Scene
 
 SERIAL = 1923054
+SHORT = replace(ORDERS, fail_safe_timeout=15)
+"""The shortest time-out that a form accepts for the usual poll interval."""
 ANY = EvboxConfig(key="scan", name="scan", address=0, installation_limit=32.0)
 
 
 class Setups(Scene):
     """One line on which buses come and go, as with searches and reloads."""
 
-    async def reload(self, *, forget: bool = False) -> None:
+    async def reload(self, *, forget: bool = False, orders: Orders = ORDERS) -> None:
         """Make a new bus; ``forget``: in a new process, which knows nothing."""
         await self.bus.stop()
         if forget:
             self.line.memory = LineMemory()
-        await self._set_up([one.config for one in self.bus.chargers.values()])
+        configs = [one.config for one in self.bus.chargers.values()]
+        await self._set_up(configs, orders)
 
-    async def _set_up(self, chargers: list[ChargerConfig]) -> None:
+    async def _set_up(
+        self, chargers: list[ChargerConfig], orders: Orders = ORDERS
+    ) -> None:
         await self.bus.stop()
         self.bus = Bus(self.line, EvboxFramer(), PROTOCOL.timing, "simulated")
         for config in chargers:
-            self.bus.add(EvboxCharger(config, ORDERS))  # type: ignore[arg-type]
+            self.bus.add(EvboxCharger(config, orders))  # type: ignore[arg-type]
         await self.bus.start()
 
     async def search(self, address: int = 0) -> list[int | str]:
@@ -267,5 +273,53 @@ def test_whatever_happens_it_is_never_asked_too_soon(
             assert too_soon(line) <= before + (learnt and interval > UNKNOWN_INTERVAL)
             if interval <= UNKNOWN_INTERVAL:
                 assert before == 0
+
+    simulate(scene())
+
+
+def test_a_silent_box_is_not_asked_within_its_interval() -> None:
+    """The shorter pauses of the back-off count for boxes with a shorter interval."""
+
+    async def scene() -> None:
+        async with stage(20) as line:
+            await line.add(SERIAL).wait_available()
+            await asyncio.sleep(45)
+            line.line.points[0].faults.dead = True
+            sent = len(line.line.sent)
+            await asyncio.sleep(300)
+            assert not line.charger.available
+            silent = line.line.pauses()[sent:]
+            assert min(silent) >= 20.0
+            assert max(silent) < 21.0
+
+    simulate(scene())
+
+
+@pytest.mark.parametrize("dead", [1, 15])
+@pytest.mark.parametrize("reload", [False, True])
+def test_dead_boxes_do_not_make_a_living_one_fall_back(
+    dead: int,
+    reload: bool,  # noqa: FBT001
+) -> None:
+    """With the shortest time-out that is offered, also right after a reload."""
+
+    async def scene() -> None:
+        point = EvboxChargePoint(SERIAL, min_interval=1)
+        async with Setups.of(point) as line:
+            assert isinstance(line, Setups)
+            # The dead ones are asked first after a reload.
+            for number in range(dead):
+                line.add(number + 1, orders=SHORT)
+            living = line.add(SERIAL, orders=SHORT)
+            await living.wait_available()
+            await asyncio.sleep(60)
+            assert living.effective_timeout == SHORT.fail_safe_timeout
+            before = len(point.orders)
+            if reload:
+                await line.reload(orders=SHORT)
+            await asyncio.sleep(120)
+            assert point.counters.fail_backs == 0
+            gaps = [b.t - a.t for a, b in pairwise(point.orders[before - 1 :])]
+            assert max(gaps) < SHORT.fail_safe_timeout
 
     simulate(scene())

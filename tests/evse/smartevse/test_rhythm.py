@@ -95,6 +95,61 @@ def test_a_search_beside_a_running_box_is_one_burst_with_its_poll() -> None:
     simulate(run())
 
 
+def test_a_box_added_again_gets_its_quiet() -> None:
+    async def run() -> None:
+        scene = PolledScene(LATER)
+        async with scene:
+            await scene.settled()
+            await scene.charge()
+            for pause in (0.5, 3.0, 6.0):
+                await asyncio.sleep(pause)
+                await scene.bus.remove(scene.charger)
+                scene.charger = scene.make_charger()
+                scene.bus.add(scene.charger)
+                await scene.until(lambda: scene.charger.available, QUIET + 1)
+            await asyncio.sleep(30)
+            assert min(quiets(scene)) >= QUIET - 0.1
+
+    simulate(run())
+
+
+def test_a_silent_box_gets_its_quiet() -> None:
+    """It may receive, though it is not received."""
+
+    async def run() -> None:
+        scene = PolledScene(LATER)
+        errors: list[int] = []
+        async with scene:
+            await scene.settled()
+            await scene.charge()
+            await scene.polled(3)
+            scene.box.mute = True
+            scene.on_step.append(lambda: errors.append(scene.outlet.error))
+            await scene.until(lambda: not scene.charger.available)
+            await asyncio.sleep(300)
+            assert not any(error & NO_COMM for error in errors)
+            assert min(quiets(scene)[-20:]) >= QUIET - 0.1
+            assert max(quiets(scene)[-20:]) < QUIET + 1.0
+
+    simulate(run())
+
+
+def test_a_later_box_is_quiet_across_a_lost_port() -> None:
+    async def run() -> None:
+        scene = PolledScene(LATER)
+        async with scene:
+            await scene.settled()
+            await scene.charge()
+            for pause in (0.5, 3.0, 6.0):
+                await asyncio.sleep(pause)
+                scene.line.unplug()
+                await scene.until(lambda: scene.charger.available, 20)
+            await asyncio.sleep(30)
+            assert min(quiets(scene)) >= QUIET - 0.1
+
+    simulate(run())
+
+
 _EVENTS = st.lists(
     st.tuples(
         st.sampled_from(("reload", "search", "alone", "unplug")),
