@@ -5,11 +5,24 @@ import asyncio
 import pytest
 
 from custom_components.evse_bus.evse.bus import Bus
+from custom_components.evse_bus.evse.dialling import UnknownBox
 from custom_components.evse_bus.evse.ews import PROTOCOL
 from custom_components.evse_bus.evse.ews.port import BoxPorts
 from tests.simulated_time import now, simulate
+from tests.virtual.ews_box import EwsBox as VirtualBox
 
+from .dialling import (
+    SERIAL as DIALS,
+    dialling,
+    expected,
+    has_reading,
+    run as dialogue,
+    server,
+    until,
+)
 from .scene import EwsScene
+
+INITIAL = 0xF0
 
 
 async def new_bus(scene: EwsScene) -> None:
@@ -51,3 +64,51 @@ def test_its_checksum_is_used_at_once(
         life.cancel()
 
     simulate(run())
+
+
+def test_after_a_long_absence_the_limit_is_back_within_ten_seconds() -> None:
+    """After a power failure it may charge without a limit: it is looked for often."""
+
+    async def run() -> None:
+        scene = EwsScene()
+        async with scene:
+            await scene.until(lambda: scene.charger().available)
+            for away in (3.0, 60.0, 600.0):
+                scene.line.cut = True
+                await asyncio.sleep(away)
+                scene.box.power_cycle(0.5)
+                await scene.until(lambda: scene.status() != INITIAL)
+                scene.line.cut = False
+                took = await scene.until(
+                    lambda: scene.box.ports[0].limit == scene.box.ports[1].limit == 16
+                )
+                assert took < 10
+                await asyncio.sleep(30)
+
+    simulate(run())
+
+
+@pytest.mark.usefixtures("socket_enabled")
+@pytest.mark.parametrize("registered", [True, False])
+def test_the_checksum_of_a_box_that_dialled_is_handed_on(
+    registered: bool,  # noqa: FBT001
+) -> None:
+    """Its identification has found it: no command of its bus is lost."""
+
+    async def scene() -> None:
+        box = VirtualBox(serial=DIALS, bcc="without_msgid")
+        unknown: list[UnknownBox] = []
+        async with server(on_unknown_box=unknown.append) as made:
+            if registered:
+                async with expected(made) as bus:
+                    with dialling(made, box):
+                        await until(lambda: has_reading(bus), 30)
+                        assert bus.wire.statistics.timeouts == 0
+                return
+            with dialling(made, box):
+                await until(lambda: unknown, 30)
+                async with expected(made) as bus:
+                    await until(lambda: has_reading(bus), 30)
+                    assert bus.wire.statistics.timeouts == 0
+
+    dialogue(scene)

@@ -17,6 +17,8 @@ type Past = Callable[[PolledScene], Awaitable[None]]
 
 CONFIRMED_WITHIN = {True: 13.0, False: 2.5}
 """By whether the dialect needs quiet, s (docs/smartevse.md)."""
+NOT_FOLLOWED_FOR = {True: 16.0, False: 11.0}
+"""By the same, s."""
 OFFSETS = {True: (0.0, 0.6, 1.0, 4.0, 5.25, 6.5, 9.5), False: (0.0, 1.0, 4.0)}
 """From the moment the box is known to the order, s: over a whole quiet time."""
 
@@ -122,5 +124,23 @@ def test_a_second_order_within_the_quiet_of_the_first(
             await asyncio.wait({first})
             values = scene.currents(since=began)
             assert all(a != b for a, b in pairwise(values))
+
+    simulate(run())
+
+
+@pytest.mark.parametrize("dialect", ALL)
+def test_a_box_that_does_not_follow_is_stopped_in_time(dialect: Dialect) -> None:
+    """From the moment a car is offered more than the limit until it is stopped."""
+
+    async def run() -> None:
+        for offset in (0.0, 1.0, 3.0, 5.0):
+            scene = PolledScene(dialect, override_works=False)
+            async with scene:
+                await scene.settled()
+                await asyncio.sleep(offset)
+                scene.car.plug_in()
+                await scene.until(lambda scene=scene: scene.box.offers > 0)
+                took = await scene.until(lambda scene=scene: scene.box.offers == 0)
+                assert took < NOT_FOLLOWED_FOR[dialect is LATER]
 
     simulate(run())

@@ -15,6 +15,8 @@ TIMING: Final = Timing(
     gap=0.1,
     longest_reply=LONGEST_FRAME,
     retry_pauses=(0.3, 1.0),
+    # After a power failure a box may charge without a limit; it is alone on its line.
+    backoff_limit=5.0,
 )
 """On RS-232."""
 TCP_TIMING: Final = replace(TIMING, reply_timeout=2.0, reply_timeout_limit=2.5, gap=2.0)

@@ -12,6 +12,7 @@ from typing import ClassVar, Final, override
 
 from ...errors import LineLostError, PortMissingError
 from ...line import Line
+from ...memory import LineMemory
 from ..timing import SETTINGS
 from ..wire.frames import LONGEST_FRAME
 
@@ -49,6 +50,8 @@ class Connection(asyncio.Protocol):
         self._transport: asyncio.Transport | None = None
         self._waiting = b""
         self.line: AcceptedLine | None = None
+        self.memory = LineMemory()
+        """What its identification has learnt of the box."""
         self.peer: Address | None = None
 
     @property

@@ -33,7 +33,7 @@ from ...framing import Frame
 from ...line import line_error
 from ...statistics import ChargerStatistics
 from ...throttle import LOSSES, LOSSES_WINDOW, RateLimiter
-from ..box import EwsBox
+from ..box import BoxMemory, EwsBox
 from ..port import BoxPorts
 from ..readings import charger_info
 from ..timing import TCP_TIMING
@@ -196,7 +196,7 @@ class Listener:
             self._cancel_timer(connection)
             self._bound[serial] = connection
             self._note_address(serial, box, connection.peer)
-            line.attach(connection)
+            _hand_over(connection, line)
         return bus
 
     async def unregister(self, serial: str) -> None:
@@ -348,7 +348,7 @@ class Listener:
         self._warned.discard(serial)
         self._bound[serial] = connection
         self._note_address(serial, box, connection.peer)
-        box.line.attach(connection)
+        _hand_over(connection, box.line)
         box.bus.reschedule()
 
     # -- Two connections with one number -----------------------------------------------
@@ -402,6 +402,13 @@ def _proof_time(box: _RegisteredBox, connection: Connection) -> float:
     return min(box.bus.wire.round_trip.timeout + PROOF_MARGIN, PROOF_TIME)
 
 
+def _hand_over(connection: Connection, line: AcceptedLine) -> None:
+    """Give an identified connection, and the box's checksum, to the bus of a line."""
+    learnt = connection.memory.of(BoxMemory)
+    line.memory.of(BoxMemory).bcc = learnt.bcc
+    line.attach(connection)
+
+
 async def _read_identity(
     connection: Connection, on_answered: Callable[[], None]
 ) -> UnknownBox:
@@ -426,7 +433,9 @@ async def _read_identity(
     wire.on_unsolicited = keep_info
     line.attach(connection)
     await line.open()
-    status = await EwsBox().wait_for_status(Turn(wire, ChargerStatistics()))
+    box = EwsBox()
+    box.memory = connection.memory.of(BoxMemory)
+    status = await box.wait_for_status(Turn(wire, ChargerStatistics()))
     if not connection.is_open:
         raise LineError("the connection has ended")
     connection.line = None
