@@ -1,6 +1,7 @@
 """Commands: written once, verified, and temporary states ended again."""
 
 import asyncio
+from contextlib import suppress
 
 import pytest
 
@@ -327,3 +328,17 @@ async def test_a_command_for_a_dead_box() -> None:
         with pytest.raises((ReplyTimeoutError, NotConfirmedError)):
             await charger.command(Command.RESET)
         assert scene.writes() == []
+
+
+async def test_a_reset_confirmed_late_says_nothing_of_the_line() -> None:
+    box = box_with(sleepy())
+    box.boot_time = 2.0
+    box.reset_answer = "after"
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders(10))
+        with suppress(NotConfirmedError):
+            await charger.command(Command.RESET)
+        assert box.resets == 1
+        trip = scene.bus.wire.round_trip
+        assert trip.timeout == scene.bus.wire.timing.reply_timeout
+        assert trip.drain == 0

@@ -9,7 +9,7 @@ effect later.
 """
 
 import asyncio
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import Enum, IntEnum
@@ -39,8 +39,8 @@ from ..modbus import ModbusFrame
 from ..protocol import Progress
 from ..schedule import Kind
 from .charger import AblCharger
-from .collect import collect
 from .config import Pauses
+from .exchanges import collect, write_once
 from .reader import read
 from .registers import (
     ADDRESSES,
@@ -393,7 +393,7 @@ class DeviceIdChange:
             self._begin(_Stage.WRITTEN)
             confirmed = False
             try:
-                confirmed = await self._write(turn, request, self._id_confirmed)
+                confirmed = await write_once(turn, request, self._id_confirmed)
             except ExchangeRefusedError as error:
                 if attempt == 0:
                     # It has no new device-ID, so a reset is not needed.
@@ -624,29 +624,7 @@ class DeviceIdChange:
 
     async def _write_state(self, turn: Turn, address: int, code: StateCode) -> bool:
         answer = write_answer(address, STATE_REGISTER)
-        return await self._write(turn, write_state(address, code), answer)
-
-    @staticmethod
-    async def _write(
-        turn: Turn, request: bytes, accept: Callable[[ModbusFrame], bool | None]
-    ) -> bool:
-        """Return whether a write was confirmed; a lost reply decides nothing.
-
-        Nor does one after the time-out: a box may confirm a reset after it, which says
-        nothing of the line.
-        """
-        is_over = False
-
-        def accept_in_time(frame: ModbusFrame) -> bool | None:
-            return None if is_over else accept(frame)
-
-        try:
-            await turn.exchange(request, accept_in_time)
-        except ReplyTimeoutError:
-            return False
-        finally:
-            is_over = True
-        return True
+        return await write_once(turn, write_state(address, code), answer)
 
     def _failed(
         self, problem: Problem, message: str, status: Reading | None = None

@@ -24,7 +24,6 @@ from ..modbus import ModbusFrame
 from ..model import ChargerConfig, Fault, Orders, OrderState
 from ..pause_watch import FOLLOW_TIME, NO_CURRENT
 from ..registers import Registers
-from .collect import collect
 from .config import TIMING, AblConfig, Pauses
 from .decisions import (
     Decision,
@@ -32,6 +31,7 @@ from .decisions import (
 )
 from .duty import PAUSE, current_for
 from .evidence import BoxEvidence
+from .exchanges import collect
 from .plausibility import MOST_READS, StatusCheck, agreeing
 from .readings import (
     EnergyEstimate,

@@ -13,7 +13,7 @@ from ..model import ChargerConfig, Orders
 from ..protocol import Progress
 from ..readings import ChargerInfo
 from ..scan import FoundCharger, ScanResult
-from .collect import collect
+from .exchanges import collect
 from .readings import charger_info
 from .registers import (
     ADDRESSES,

@@ -17,6 +17,7 @@ from ..safety import Setpoint
 from .config import AblConfig
 from .decisions import FAILED_AFTER, is_taken
 from .duty import PAUSE
+from .exchanges import write_once
 from .reader import AblReader
 from .registers import (
     CONFIGURATION_REGISTER,
@@ -143,12 +144,9 @@ class AblWriter(AblReader):
         await self.identify(turn)
         if code is StateCode.E0:
             self.on_e0_sent(turn.now)
-        request = write_state(self.config.address, code)
-        try:
-            await self._write(turn, request, STATE_REGISTER)
-        except ReplyTimeoutError:
-            return False
-        return True
+        address = self.config.address
+        answer = write_answer(address, STATE_REGISTER)
+        return await write_once(turn, write_state(address, code), answer)
 
     async def set_configuration(
         self,

@@ -1,6 +1,8 @@
-"""A read of one device-ID in which every reply counts, not only the first."""
+"""Exchanges with a box in which the first reply is not all that counts."""
 
-from ..errors import GarbledReplyError
+from collections.abc import Callable
+
+from ..errors import GarbledReplyError, ReplyTimeoutError
 from ..exchange import Turn
 from ..modbus import ModbusFrame
 from ..registers import Registers
@@ -30,3 +32,25 @@ async def collect[T](
         if not (replies and disturbed):
             raise
     return replies
+
+
+async def write_once(
+    turn: Turn, request: bytes, accept: Callable[[ModbusFrame], bool | None]
+) -> bool:
+    """Send a write; return whether it was confirmed. A lost reply decides nothing.
+
+    Nor does a late one: a box that confirms a reset after it is no slow line, whose
+    reply time-out would have to grow. Raises ExchangeRefusedError.
+    """
+    is_over = False
+
+    def accept_in_time(frame: ModbusFrame) -> bool | None:
+        return None if is_over else accept(frame)
+
+    try:
+        await turn.exchange(request, accept_in_time)
+    except ReplyTimeoutError:
+        return False
+    finally:
+        is_over = True
+    return True
