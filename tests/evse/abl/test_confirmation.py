@@ -486,3 +486,59 @@ def test_any_box_and_any_sequence(
             assert oracle.violations == []
 
     simulate(scene_of())
+
+
+@settings(
+    max_examples=12,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
+    phases=(Phase.explicit, Phase.reuse, Phase.generate),
+    derandomize=True,
+)
+@given(
+    _boxes,
+    st.sampled_from([None, 6.0, 10.0]),
+    st.lists(
+        st.tuples(st.sampled_from([6, 8, 10, 16, 32]), st.sampled_from([0.5, 12.0])),
+        min_size=1,
+        max_size=5,
+    ),
+    st.sampled_from([None, True]),
+)
+def test_no_limit_ends_a_pause_of_another(
+    draw: dict[str, Any],
+    before: float | None,
+    limits: list[tuple[int, float]],
+    allowed: bool | None,  # noqa: FBT001
+) -> None:
+    """Whatever limit stood before, and whichever come after."""
+
+    async def scene_of() -> None:
+        box = _made({**draw, "e0_after_pause": None})
+        car = box.outlet.car
+        assert car is not None
+        # In C, a box that reports no Icmax would be taken for one without a pause.
+        car.requesting = False
+        oracle = Oracle(box)
+        async with Scene(box) as scene:
+            charger = scene.add(
+                config(poll_interval=2.0, installation_limit=32),
+                orders(16, allowed=allowed),
+            )
+            await asyncio.sleep(10)
+            if before is not None:
+                with suppress(EvseError):
+                    await charger.change_orders(limit(before))
+            await _step("foreign pause", box, charger, oracle)
+            car.request()
+            await asyncio.sleep(3)
+            for current, pause in limits:
+                with suppress(EvseError):
+                    await charger.change_orders(limit(current))
+                await asyncio.sleep(pause)
+            await asyncio.sleep(30)
+            assert oracle.violations == []
+            assert box.outlet.icmax == PAUSE
+            assert box.ic_amps == 0
+
+    simulate(scene_of())
