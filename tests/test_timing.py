@@ -23,6 +23,7 @@ MODES = 8
 TIMED = (
     "abl/config.py",
     "abl/decisions.py",
+    "abl/device_id.py",
     "abl/evidence.py",
     "abl/reader.py",
     "abl/writer.py",
