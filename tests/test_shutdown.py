@@ -9,7 +9,7 @@ from homeassistant.const import EVENT_HOMEASSISTANT_STOP, Platform
 from homeassistant.core import HomeAssistant
 import pytest
 
-from custom_components.evse_bus import managed_charger
+from custom_components.evse_bus.chargers import managed
 from custom_components.evse_bus.evse.smartevse import PolledSmartEvse
 from custom_components.evse_bus.stores.orders import ORDERS_KEY
 from tests.common import (
@@ -32,7 +32,7 @@ async def stop(hass: HomeAssistant) -> None:
 
 @pytest.fixture
 def short_patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(managed_charger, "SHUTDOWN_TIMEOUT", 0.5)
+    monkeypatch.setattr(managed, "SHUTDOWN_TIMEOUT", 0.5)
 
 
 @pytest.mark.parametrize("dialect", ACCESS)

@@ -210,8 +210,9 @@ def test_the_coordinator_does_not_know_what_stands_on_it() -> None:
         "flows",
     }
     for name in (
-        *("coordinator", "connections", "devices", "discovery", "issues"),
-        *("managed_charger", "supply", "configuration", "errors", "const", "identity"),
+        *("coordinator", "connections", "discovery", "issues"),
+        *("supply", "configuration", "errors", "const", "identity"),
+        *("chargers/devices", "chargers/managed", "chargers/subentries"),
         *("stores/file", "stores/orders"),
     ):
         used = local(INTEGRATION / f"{name}.py", INTEGRATION)

@@ -87,7 +87,7 @@ async def async_setup_entry(hass: HomeAssistant, entry: EvseBusConfigEntry) -> b
         entry.async_on_unload(async_offer_when_started(hass, entry, listener))
 
     async def async_update_time_zone(_event: Event[Any]) -> None:
-        await coordinator.async_sync_subentries()
+        await coordinator.all_chargers.async_sync()
 
     entry.async_on_unload(
         hass.bus.async_listen(EVENT_CORE_CONFIG_UPDATE, async_update_time_zone)
@@ -142,4 +142,4 @@ async def _async_updated(hass: HomeAssistant, entry: EvseBusConfigEntry) -> None
         hass.config_entries.async_schedule_reload(entry.entry_id)
         return
     await coordinator.async_update_supply()
-    await coordinator.async_sync_subentries()
+    await coordinator.all_chargers.async_sync()

@@ -13,6 +13,7 @@ from homeassistant.const import EntityCategory, Platform
 from homeassistant.core import HomeAssistant
 from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
 
+from .chargers.managed import ManagedCharger
 from .coordinator import BusCoordinator, EvseBusConfigEntry
 from .entity import (
     BusEntity,
@@ -25,7 +26,6 @@ from .evse.bus import Bus
 from .evse.master import BusMaster
 from .evse.model import Capability, Fault
 from .evse.readings import ChargerReading, ConnectorReading
-from .managed_charger import ManagedCharger
 from .sensor_tables import WAITING
 
 PARALLEL_UPDATES = 0

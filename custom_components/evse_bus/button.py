@@ -10,11 +10,11 @@ from homeassistant.const import EntityCategory, Platform
 from homeassistant.core import HomeAssistant
 from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
 
+from .chargers.managed import ManagedCharger
 from .coordinator import BusCoordinator, EvseBusConfigEntry
 from .entity import ChargerEntity, add_charger_entities, supported
 from .errors import translated_errors
 from .evse.model import Capability, Command
-from .managed_charger import ManagedCharger
 
 PARALLEL_UPDATES = 0
 

@@ -11,12 +11,12 @@ from homeassistant.const import CONF_ADDRESS, CONF_DEVICE, CONF_HOST
 from homeassistant.core import HomeAssistant
 from homeassistant.helpers.device_registry import ChildDeviceEntry, DeviceEntry
 
+from .chargers.managed import ManagedCharger
 from .connections import ListenerConnections
 from .const import CONF_SERIAL, DOMAIN
 from .coordinator import BusCoordinator, EvseBusConfigEntry
 from .evse.bus import Bus
 from .evse.statistics import Direction
-from .managed_charger import ManagedCharger
 
 _PRIVATE: Final = frozenset({CONF_DEVICE, CONF_HOST, CONF_SERIAL, "user"})
 """Keys that identify a person or house, in any protocol.

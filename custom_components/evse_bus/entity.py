@@ -17,13 +17,13 @@ from homeassistant.helpers.entity import Entity, EntityDescription
 from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
 from homeassistant.helpers.update_coordinator import BaseCoordinatorEntity
 
+from .chargers.devices import charger_info, connector_info
+from .chargers.managed import ManagedCharger
 from .const import DOMAIN
 from .coordinator import BUS, BusCoordinator, Context, EvseBusConfigEntry
-from .devices import charger_info, connector_info
 from .evse.charger import Charger
 from .evse.model import Capability, Range, Setting
 from .evse.readings import ConnectorReading
-from .managed_charger import ManagedCharger
 
 _ADDING_STATES: Final = (ConfigEntryState.SETUP_IN_PROGRESS, ConfigEntryState.LOADED)
 

@@ -14,6 +14,7 @@ from homeassistant.const import Platform
 from homeassistant.core import HomeAssistant, callback
 from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
 
+from .chargers.managed import ManagedCharger
 from .coordinator import BusCoordinator, EvseBusConfigEntry
 from .entity import ChargerEntity, add_charger_entities, supported
 from .evse.events import (
@@ -26,7 +27,6 @@ from .evse.events import (
     StartRequested,
 )
 from .evse.model import Capability
-from .managed_charger import ManagedCharger
 
 PARALLEL_UPDATES = 0
 

@@ -7,12 +7,12 @@ from homeassistant.config_entries import ConfigEntry
 from homeassistant.core import HomeAssistant
 from homeassistant.helpers import device_registry as dr, issue_registry as ir
 
+from .chargers.managed import ManagedCharger
 from .configuration import protocol_of
 from .const import CONF_ENTRY, CONF_SERIAL, CONF_SUBENTRY, DOMAIN
 from .evse.model import Fault, Orders
 from .evse.safety import INTERVALS_PER_TIMEOUT
 from .identity import Holder, another_box_texts, holder
-from .managed_charger import ManagedCharger
 
 NOT_STORED: Final = "orders_not_stored"
 LOST: Final = "orders_lost"

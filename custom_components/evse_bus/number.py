@@ -27,6 +27,7 @@ from homeassistant.const import (
 from homeassistant.core import HomeAssistant
 from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
 
+from .chargers.managed import ManagedCharger
 from .coordinator import BusCoordinator, EvseBusConfigEntry
 from .entity import BusEntity, ChargerEntity, SettingEntity, add_charger_entities
 from .errors import ActionError, translated_errors, wrong_action
@@ -40,7 +41,6 @@ from .evse.model import (
     Phases,
     Setting,
 )
-from .managed_charger import ManagedCharger
 from .supply import STEP, SharedSupply
 
 PARALLEL_UPDATES = 0

@@ -8,11 +8,11 @@ from homeassistant.const import EntityCategory, Platform
 from homeassistant.core import HomeAssistant
 from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
 
+from .chargers.managed import ManagedCharger
 from .coordinator import BusCoordinator, EvseBusConfigEntry
 from .entity import ChargerEntity, SettingEntity, add_charger_entities
 from .errors import translated_errors
 from .evse.model import Capability, Command, Mode, Setting
-from .managed_charger import ManagedCharger
 
 PARALLEL_UPDATES = 0
 

@@ -14,6 +14,7 @@ from homeassistant.core import HomeAssistant
 from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
 from homeassistant.util import dt as dt_util
 
+from .chargers.managed import ManagedCharger
 from .connections import ListenerConnections
 from .coordinator import (
     BUS,
@@ -33,7 +34,6 @@ from .entity import (
 )
 from .evse.meter import HIGHEST_CURRENT
 from .evse.model import Capability, Fault
-from .managed_charger import ManagedCharger
 from .sensor_tables import (
     BUS_SENSORS,
     CHARGER_SENSORS,

@@ -28,8 +28,8 @@ from .evse.errors import NotConfirmedError
 if TYPE_CHECKING:
     from homeassistant.helpers.device_registry import AnyDeviceEntry
 
+    from .chargers.managed import ManagedCharger
     from .coordinator import BusCoordinator, EvseBusConfigEntry
-    from .managed_charger import ManagedCharger
 
 
 @callback

@@ -9,6 +9,7 @@ from homeassistant.const import EntityCategory, Platform
 from homeassistant.core import HomeAssistant
 from homeassistant.helpers.entity_platform import AddConfigEntryEntitiesCallback
 
+from .chargers.managed import ManagedCharger
 from .coordinator import BusCoordinator, EvseBusConfigEntry
 from .entity import (
     ChargerEntity,
@@ -20,7 +21,6 @@ from .errors import translated_errors
 from .evse.charger import Charger
 from .evse.model import Capability, Command, OrderChange
 from .evse.readings import ConnectorReading
-from .managed_charger import ManagedCharger
 
 PARALLEL_UPDATES = 0
 

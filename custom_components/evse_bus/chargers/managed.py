@@ -8,14 +8,14 @@ from homeassistant.config_entries import ConfigSubentry
 from homeassistant.core import CALLBACK_TYPE
 from homeassistant.helpers.entity import Entity
 
-from .configuration import port_count
-from .const import LOGGER
-from .evse.bus import Bus
-from .evse.charger import Charger
-from .evse.errors import EvseError
-from .evse.events import Events
-from .evse.readings import ConnectorReading
-from .identity import identity_of
+from ..configuration import port_count
+from ..const import LOGGER
+from ..evse.bus import Bus
+from ..evse.charger import Charger
+from ..evse.errors import EvseError
+from ..evse.events import Events
+from ..evse.readings import ConnectorReading
+from ..identity import identity_of
 
 SHUTDOWN_TIMEOUT: Final = 5.0
 """Longest time a charger may delay the stop of Home Assistant, s."""

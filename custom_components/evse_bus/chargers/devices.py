@@ -11,8 +11,8 @@ from homeassistant.helpers.device_registry import (
     DeviceInfo,
 )
 
-from .const import DOMAIN, MANUFACTURER
-from .managed_charger import ManagedCharger
+from ..const import DOMAIN, MANUFACTURER
+from .managed import ManagedCharger
 
 
 class BusDevices:
