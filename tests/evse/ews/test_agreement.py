@@ -195,6 +195,28 @@ def test_implausible_meters_hold_up_no_command() -> None:
     play(EwsScene(), acts)
 
 
+@pytest.mark.parametrize("lost", range(1, 12))
+def test_a_command_survives_any_one_lost_reading(lost: int) -> None:
+    """A record that has changed is read twice: either reply may get lost."""
+
+    async def acts(scene: EwsScene) -> None:
+        await scene.charge()
+        answers = 0
+
+        def mute(name: str) -> bool:
+            nonlocal answers
+            answers += name in ("rc", "rd", "rs", "id")
+            return answers == lost and name not in ("st", "sl")
+
+        scene.line.mute = mute
+        await scene.charger().change_orders(OrderChange(current=10.0))
+        await scene.charger().change_orders(OrderChange(allowed=False))
+        assert scene.status() == 0x50
+        assert answers >= lost
+
+    play(EwsScene(), acts)
+
+
 # -- Agreement -----------------------------------------------------------------------
 
 

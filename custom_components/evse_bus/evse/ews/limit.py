@@ -167,7 +167,7 @@ class Limiter:
         port = self._port
         try:
             await port.read_status(turn)
-            await port.box.read_details(turn)
+            await port.read(turn, port.box.read_details)
         except ReplyTimeoutError:
             return False
         port.take_status()

@@ -7,12 +7,13 @@ PROTOCOLS.md, 4.
 
 from abc import abstractmethod
 import asyncio
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from math import inf
 from typing import ClassVar, Final, override
 
 from ..charger import Charger
+from ..conversation import rest
 from ..errors import (
     EvseError,
     NotAvailableError,
@@ -30,6 +31,8 @@ from .timing import COMMAND_MARGIN, COMMAND_TIMEOUT, TIMING
 from .wire.frames import LONGEST_FRAME, CommandId, Request
 from .wire.status import PortStatus
 
+READS: Final = 3
+"""Attempts to read in the course of a command."""
 _SOONER: Final = 1.0
 """A poll due later than the box's deadline is moved to this time before it, s."""
 
@@ -161,8 +164,26 @@ class BoxPort(Charger[EwsPortConfig]):
         """
         box = self.box
         while not box.identified or box.installation is None:
-            await box.identify(turn)
+            await self.read(turn, box.identify)
         self._check_identity()
+
+    async def read[T](
+        self, turn: Turn, conversation: Callable[[Turn], Awaitable[T]]
+    ) -> T:
+        """Read from the box; a command under way does not fail for one lost reply.
+
+        After a lost reply the box is identified anew. Raises what it raises in the end.
+        """
+        for _ in range(READS - 1):
+            try:
+                await self.box.identify(turn)
+                return await conversation(turn)
+            except ReplyTimeoutError:
+                if not self.busy:
+                    raise
+            await rest(0.0)
+        await self.box.identify(turn)
+        return await conversation(turn)
 
     def _check_identity(self) -> None:
         found, expected = self.box.serial, self.config.serial
@@ -182,7 +203,7 @@ class BoxPort(Charger[EwsPortConfig]):
         Raises NotAvailableError for a port that the box does not have, and what
         `EwsBox.read` raises.
         """
-        await self.box.read_ports(turn)
+        await self.read(turn, self.box.read_ports)
         return self.take_status()
 
     async def read_fresh_status(self, turn: Turn) -> PortStatus:
