@@ -17,6 +17,7 @@ from . import (
     ews_poll,
     exchange_cpu,
     home_assistant,
+    hostile_bytes,
     set_value,
     slow_lines,
     smartevse_master,
@@ -42,6 +43,7 @@ BENCHMARKS: Final = {
         byte_errors,
         adapter_away,
         slow_lines,
+        hostile_bytes,
     )
 }
 
