@@ -9,7 +9,7 @@ from custom_components.evse_bus.evse.errors import GarbledReplyError, WrongCharg
 from custom_components.evse_bus.evse.model import Capability, Fault, OrderChange, Status
 from tests.virtual import AblBox, Car, Request
 
-from .scene import LIMIT, Scene, config, orders, until
+from .scene import LIMIT, Scene, answers, config, orders, until
 
 
 def plugged(**settings: float) -> Car:
@@ -227,9 +227,21 @@ async def test_a_second_box_with_the_same_id_is_noticed() -> None:
         scene.virtual.add(
             AblBox(1, serial="2W22xy99999999", turn_round=0.0023, jitter=0.0)
         )
-        await until(lambda: Fault.DUPLICATE_ADDRESS in charger.faults)
+        await until(lambda: Fault.DUPLICATE_ADDRESS in charger.faults, 120)
         scene.virtual.remove(scene.virtual.devices[-1])
-        await until(lambda: Fault.DUPLICATE_ADDRESS not in charger.faults)
+        await until(lambda: Fault.DUPLICATE_ADDRESS not in charger.faults, 120)
+
+
+async def test_a_few_garbled_replies_are_no_second_box() -> None:
+    box = AblBox(1)
+    async with Scene(box) as scene:
+        charger = await scene.settled(config(), orders())
+        seen: list[bool] = []
+        charger.subscribe(lambda: seen.append(bool(charger.noticed)))
+        answers(box, *[b">0103xx\r\n"] * 5)
+        await until(lambda: charger.misses == 3)
+        await until(lambda: charger.available, 30)
+        assert not any(seen)
 
 
 async def test_echo_noise_and_errors_are_never_misread() -> None:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final, override
 
+from ..collisions import Collisions
 from ..conversation import Conversation, FollowUp
 from ..errors import GarbledReplyError, NotAvailableError, ReplyTimeoutError
 from ..exchange import Turn
@@ -32,9 +33,6 @@ from .registers import Reading, StateCode, limit_duty
 from .states import E0, E2, SETUP, is_failure
 from .steps import reach_state, refuse_in, restore
 from .writer import AblWriter
-
-GARBLED_REPLIES: Final = 3
-"""Unreadable replies in a row that suggest two boxes with one device-ID."""
 
 _CAPABILITIES: Final = frozenset(
     {
@@ -71,7 +69,7 @@ class AblCharger(AblWriter):
         """Nothing is known of the box before its first reply."""
         super().__init__(config, orders)
         self._active: _ActiveCommand | None = None
-        self._garbled = 0
+        self._collisions = Collisions()
         self._fell_back = False
         """The fail-safe of expired orders has been applied."""
 
@@ -119,11 +117,10 @@ class AblCharger(AblWriter):
             await self.identify(turn)
             status = await self.poll_status(turn)
         except GarbledReplyError:
-            self._garbled += 1
-            if self._garbled >= GARBLED_REPLIES:
+            if self._collisions.garbled(turn.now):
                 self.notice(Fault.DUPLICATE_ADDRESS, present=True)
             raise
-        self._garbled = 0
+        self._collisions.good(turn.now)
         self.notice(Fault.DUPLICATE_ADDRESS, present=False)
         return self._next_action(status, turn.now)
 

@@ -2,8 +2,9 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Final, override
+from typing import override
 
+from ..collisions import Collisions
 from ..conversation import FollowUp, rest
 from ..errors import GarbledReplyError
 from ..exchange import Turn
@@ -13,9 +14,6 @@ from .dialects import MAPS
 from .reader import SmartEvseReader
 from .settings import setting_conversation
 
-GARBLED: Final = 3
-"""Garbled replies in a row that look like two boxes with one address."""
-
 
 class SmartEvseCharger[C: SmartEvseConfig](SmartEvseReader[C]):
     """One SmartEVSE."""
@@ -23,7 +21,7 @@ class SmartEvseCharger[C: SmartEvseConfig](SmartEvseReader[C]):
     def __init__(self, config: C, orders: Orders) -> None:
         """Begin with an unknown box."""
         super().__init__(config, orders)
-        self._garbled = 0
+        self._collisions = Collisions()
 
     # -- The regular turn ----------------------------------------------------------
 
@@ -35,11 +33,10 @@ class SmartEvseCharger[C: SmartEvseConfig](SmartEvseReader[C]):
             else:
                 await self.read_status_once(turn)
         except GarbledReplyError:
-            self._garbled += 1
-            if self._garbled >= GARBLED:
+            if self._collisions.garbled(turn.now):
                 self.notice(Fault.DUPLICATE_ADDRESS, present=True)
             raise
-        self._garbled = 0
+        self._collisions.good(turn.now)
         self.notice(Fault.DUPLICATE_ADDRESS, present=self.shares_address)
         return self._next_action(turn.now)
 
