@@ -452,7 +452,10 @@ class Bus(Observable):
     def _on_open(self, is_new: bool) -> None:  # noqa: FBT001 - a callback
         now = self.now
         for charger in self.chargers.values():
-            charger.on_line_open()
+            if is_new:
+                charger.on_line_open()
+            else:
+                charger.on_line_reopened()
             # Its last request may have arrived right before the line was lost.
             charger.slot.ready = now + charger.minimum_pause(now)
         if self.master is not None:

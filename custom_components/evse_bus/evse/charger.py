@@ -304,6 +304,13 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
     def on_line_open(self) -> None:
         """Drop all state that must be checked anew after each (re)connect."""
 
+    def on_line_reopened(self) -> None:
+        """Do the same where the line was closed and opened again at once.
+
+        Some adapters close an idle connection all the time.
+        """
+        self.on_line_open()
+
     def plan(self, now: float) -> None:
         """Set in `slot` when the next regular exchange may and must be."""
         self.slot.ready = self.slot.due = now + self.config.poll_interval

@@ -9,6 +9,7 @@ import pytest
 
 from custom_components.evse_bus.evse.errors import (
     NotAvailableError,
+    PortMissingError,
     ReplyTimeoutError,
     WrongChargerError,
 )
@@ -456,8 +457,11 @@ def test_after_a_lost_port_the_minimum_interval_is_kept() -> None:
             charger = stage.add()
             await asyncio.sleep(41.0)
             sent = len(stage.line.sent)
+            stage.line.refuse_open = PortMissingError("away")
             stage.line.unplug()
-            await asyncio.sleep(30.0)
+            await asyncio.sleep(3.0)
+            stage.line.refuse_open = None
+            await asyncio.sleep(27.0)
             assert stage.line.is_open
             assert charger.available
             assert all(six(stage.line)[sent:])

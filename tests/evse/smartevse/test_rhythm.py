@@ -150,6 +150,38 @@ def test_a_later_box_is_quiet_across_a_lost_port() -> None:
     simulate(run())
 
 
+@pytest.mark.parametrize("dialect", ALL)
+@pytest.mark.parametrize("how", ["restart", "reload", "unplug", "again"])
+def test_a_pause_that_was_undone_meanwhile_stands_again(
+    dialect: Dialect, how: str
+) -> None:
+    """Access was opened while we were away; with a car in, in the first burst."""
+
+    async def run() -> None:
+        scene = PolledScene(dialect, allowed=False)
+        async with scene:
+            await scene.settled()
+            scene.car.plug_in()
+            await scene.polled(2)
+            assert not scene.outlet.access
+            if how in ("restart", "reload"):
+                await scene.bus.stop()
+                scene.outlet.set_access(True)
+                await scene.restart(away=3.0, reload=how == "reload")
+            elif how == "unplug":
+                scene.outlet.set_access(True)
+                scene.line.unplug()
+            else:
+                await scene.bus.remove(scene.charger)
+                scene.outlet.set_access(True)
+                scene.charger = scene.make_charger()
+                scene.bus.add(scene.charger)
+            took = await scene.until(lambda: not scene.outlet.access)
+            assert took < (QUIET + 1.0 if dialect is LATER else 2.5)
+
+    simulate(run())
+
+
 _EVENTS = st.lists(
     st.tuples(
         st.sampled_from(("reload", "search", "alone", "unplug")),

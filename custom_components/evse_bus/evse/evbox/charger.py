@@ -226,6 +226,13 @@ class EvboxCharger(Charger[EvboxConfig]):
         self._other_serial = None
         self._implausible = 0
 
+    @override
+    def on_line_reopened(self) -> None:
+        # Between two polls of a box that answers nothing has taken its place; each time
+        # down to 6 A, it would never get more behind an adapter that closes idle lines.
+        if self.misses:
+            self.on_line_open()
+
     # -- Conversations -----------------------------------------------------------
 
     @override
