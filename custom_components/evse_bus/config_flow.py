@@ -2,6 +2,7 @@
 
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from functools import partial
 from typing import Any, Final, override
 
@@ -29,7 +30,8 @@ from .const import (
 )
 from .coordinator import EvseBusConfigEntry
 from .evse.bus import Bus
-from .evse.errors import RefusedOrderError
+from .evse.errors import LineLostError, RefusedOrderError
+from .evse.gateway import speaks_modbus_tcp
 from .evse.protocol import Progress, Protocol
 from .evse.protocols import protocols_by_make
 from .evse.scan import ScanResult
@@ -301,8 +303,26 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
     @override
     async def async_scan(self, progress: Progress) -> ScanResult:
         """Open the port for a search, and close it again in any case."""
-        async with self.started_bus() as bus:
-            return await async_search(self.protocol, bus, self._searches, progress)
+        lost: LineLostError | None = None
+        result = ScanResult()
+        try:
+            async with self.started_bus() as bus:
+                result = await async_search(
+                    self.protocol, bus, self._searches, progress
+                )
+        except LineLostError as error:
+            lost = error
+        if not result.found and not result.gateway:
+            # The bus is closed again: an adapter may accept one connection only.
+            gateway = await speaks_modbus_tcp(
+                self.bus_data[CONF_DEVICE],
+                line_settings(self.bus_data),
+                closes=lost is not None,
+            )
+            result = replace(result, gateway=gateway)
+        if lost is not None and not result.gateway:
+            raise lost
+        return result
 
     @override
     @asynccontextmanager

@@ -107,7 +107,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         await self._async_start_supply()
         await self.all_chargers.async_start()
         if self.bus is not None:
-            self._unsubscribe.append(self.bus.subscribe(partial(self._notify, BUS)))
+            self._unsubscribe.append(self.bus.subscribe(self._on_bus))
         await self.connections.start()
 
     async def _async_start_supply(self) -> None:
@@ -154,6 +154,13 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         self._notify(BUS)
         if self.connections.master is not None:
             await self.connections.master.change_circuit(circuit)
+
+    @callback
+    def _on_bus(self) -> None:
+        """Handle a port that was lost or is back, or another change of the line."""
+        if self.bus is not None:
+            self.issues.check_line(self.bus)
+        self._notify(BUS)
 
     @callback
     def _on_master(self) -> None:

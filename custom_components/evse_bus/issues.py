@@ -10,6 +10,7 @@ from homeassistant.helpers import device_registry as dr, issue_registry as ir
 from .chargers.managed import ManagedCharger
 from .configuration import protocol_of
 from .const import CONF_ENTRY, CONF_SERIAL, CONF_SUBENTRY, DOMAIN
+from .evse.bus import Bus
 from .evse.model import Fault, Orders
 from .evse.safety import INTERVALS_PER_TIMEOUT
 from .identity import Holder, another_box_texts, holder
@@ -20,6 +21,7 @@ SUPPLY_LOST: Final = "supply_lost"
 TIMEOUT_RAISED: Final = "timeout_raised"
 ENERGY_NOT_COUNTED: Final = "energy_not_counted"
 SECOND_MASTER: Final = "second_master"
+MODBUS_TCP: Final = "modbus_tcp"
 SET_UP_TWICE: Final = "set_up_twice"
 
 WRONG_CHARGER: Final = "wrong_charger"
@@ -151,6 +153,15 @@ class BusIssues:
             self._entry.entry_id,
             present=Fault.SECOND_MASTER in noticed,
             placeholders={"bus": self._entry.title},
+        )
+
+    def check_line(self, bus: Bus) -> None:
+        """Report or clear what is wrong with the adapter of a bus."""
+        self._set(
+            MODBUS_TCP,
+            self._entry.entry_id,
+            present=bus.wire.gateway.detected,
+            placeholders={"bus": self._entry.title, "port": bus.line.url},
         )
 
     def check(self, managed: ManagedCharger) -> None:

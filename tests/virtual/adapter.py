@@ -25,7 +25,7 @@ LENGTH_AT = 4
 NO_REPLY = 0x0B  # "gateway target device failed to respond" (application protocol, 7)
 NOT_MODBUS = 1  # "illegal function"
 
-GatewayKind = Literal["silent", "closes", "answers"]
+GatewayKind = Literal["silent", "closes", "answers", "mute"]
 
 
 class ModbusTcpGateway:
@@ -33,7 +33,8 @@ class ModbusTcpGateway:
 
     A request without the header of Modbus TCP is dropped, by the implementation guide
     (4.4.2.1). Not in it is what some do beside that: `closes` the connection, or
-    `answers` with an exception.
+    `answers` with an exception. One that is `mute` drops it as well, and does not
+    answer Modbus TCP either while no unit answers (an option of many gateways).
     """
 
     def __init__(self, kind: GatewayKind = "silent") -> None:
@@ -64,7 +65,8 @@ class ModbusTcpGateway:
                 break
             if len(self._received) < end:
                 break
-            answer += exception(header, self._received[MBAP], NO_REPLY)
+            if self.kind != "mute":
+                answer += exception(header, self._received[MBAP], NO_REPLY)
             del self._received[:end]
         return answer
 

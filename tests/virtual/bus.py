@@ -124,11 +124,16 @@ class VirtualBus(LoopThread):
         return cls(devices, make, **options)  # type: ignore[arg-type]
 
     @classmethod
-    def in_loop(cls, *devices: Device, **options: float | str | None) -> VirtualBus:
-        """Make a bus on the running loop, on a `DirectPort`."""
+    def in_loop(
+        cls, *devices: Device, network: bool = False, **options: float | str | None
+    ) -> VirtualBus:
+        """Make a bus on the running loop, on a `DirectPort`.
+
+        `network`: its URL is that of a TCP port.
+        """
 
         def make(bus: VirtualBus) -> Port:
-            return DirectPort(bus.adapter.from_client)
+            return DirectPort(bus.adapter.from_client, network=network)
 
         return cls(devices, make, own_thread=False, **options)  # type: ignore[arg-type]
 

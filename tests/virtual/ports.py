@@ -266,13 +266,16 @@ class DirectPort:
 
     _numbers = itertools.count()
 
-    def __init__(self, on_bytes: Callable[[bytes], None]) -> None:
-        """Choose a unique name."""
+    def __init__(
+        self, on_bytes: Callable[[bytes], None], *, network: bool = False
+    ) -> None:
+        """Choose a unique name; ``network``: that of a TCP port."""
         self.on_bytes = on_bytes
         self.client: DirectTransport | None = None
         self.overruns = 0
         self.opened = 0
-        self._url = f"/dev/ttyVirtual{next(self._numbers)}"
+        prefix = "socket://virtual:" if network else "/dev/ttyVirtual"
+        self._url = f"{prefix}{next(self._numbers)}"
         self._plugged = False
         self._answer: Answer = "accepts"
         self.ports[self._url] = self
@@ -290,7 +293,7 @@ class DirectPort:
     @classmethod
     def find(cls, url: str) -> DirectPort | None:
         """Return the port of a name or of a link to it, unplugged or not."""
-        return cls.ports.get(os.path.realpath(url))
+        return cls.ports.get(url) or cls.ports.get(os.path.realpath(url))
 
     async def connect(self, protocol: asyncio.Protocol) -> DirectTransport:
         """Open it as a client; raises OSError as a serial port or a socket would."""

@@ -77,6 +77,7 @@ class Bus(Observable):
         self.port.on_open = self._on_open
         self.port.on_closed = self._jobs.fail_all
         self.port.on_lost = self._on_lost
+        self.wire.gateway.on_changed = self.updated
         self._turn_of: Slot | None = None
         self._turn_over = asyncio.Event()
         self._last = Turns()

@@ -17,6 +17,7 @@ from .errors import (
     ReplyTimeoutError,
 )
 from .framing import Frame, Framer, Timing
+from .gateway import PATIENCE, PROBE, GatewayWatch
 from .line import Line
 from .recovery import LineRecovery
 from .round_trip import RoundTrip
@@ -56,6 +57,7 @@ class Wire:
         self.frames = FrameLog()
         self.recovery = LineRecovery()
         self.round_trip = RoundTrip(timing)
+        self.gateway = GatewayWatch()
         self.on_times_changed: Callable[[], None] = lambda: None
         """Called when exchanges take another time than before, usually or at worst."""
         self.on_unsolicited: Callable[[Frame], bool] = lambda _frame: False
@@ -119,6 +121,7 @@ class Wire:
         self._drop_incomplete_frame()
         bad, noise = self._framer.bad, self._framer.noise
         started = loop.time()
+        self.gateway.sent(data, started)
         sent = self.line.write(data, reply_may_equal=reply_may_equal)
         self.sent_at = self.line.memory.sent_at = sent
         pending = _PendingReply(
@@ -138,6 +141,7 @@ class Wire:
             counted.timeouts += 1
             if self._received_at < started:
                 self.recovery.unanswered(loop.time())
+            self.gateway.unanswered()
             self._unanswered.append(_Unanswered(accept, sent, loop.time()))
             self._framer.reset()
             if self._is_disturbed(bad, noise, counted):
@@ -184,6 +188,21 @@ class Wire:
         # The line is in use until the last byte has been sent.
         await asyncio.sleep(sent - asyncio.get_running_loop().time())
         return sent
+
+    async def ask_gateway(self) -> None:
+        """Ask an adapter behind which nothing answers whether it speaks Modbus TCP.
+
+        To be called right after the connection was opened. Raises LineBusyError and
+        LineLostError.
+        """
+        await self._silence()
+        loop = asyncio.get_running_loop()
+        self.gateway.sent(PROBE, loop.time())
+        self.line.write(PROBE)
+        self.frames.add(Direction.OUT, PROBE)
+        await asyncio.sleep(PATIENCE)
+        self.gateway.unanswered()
+        self._framer.reset()
 
     async def _drain(self) -> None:
         """Wait for the late reply to a request that has timed out, on a slow line."""
@@ -245,6 +264,7 @@ class Wire:
     def _on_data(self, data: bytes) -> None:
         self._received_at = asyncio.get_running_loop().time()
         self.recovery.received()
+        self.gateway.received(data)
         framer = self._framer
         bad, noise = framer.bad, framer.noise
         frames = framer.feed(data)
@@ -252,6 +272,8 @@ class Wire:
             self.statistics.bad_frames += framer.bad - bad
             self.statistics.noise_bytes += framer.noise - noise
             self.frames.add(Direction.UNREADABLE, framer.redacted(data))
+        if frames:
+            self.gateway.understood()
         for frame in frames:
             self.statistics.frames += 1
             self.frames.add(Direction.IN, framer.redacted(frame.raw))

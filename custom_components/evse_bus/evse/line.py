@@ -131,6 +131,11 @@ class Line:
         self._held = 0
 
     @property
+    def is_network(self) -> bool:
+        """Return whether it is a TCP port that is to pass bytes as they are."""
+        return self.url.startswith("socket://")
+
+    @property
     def is_open(self) -> bool:
         """Return whether bytes can be sent."""
         return self._transport is not None

@@ -6,6 +6,7 @@ for its chargers and commands.
 
 import asyncio
 from collections.abc import Callable
+from contextlib import suppress
 from enum import Enum, auto
 import logging
 from math import inf
@@ -13,6 +14,7 @@ from typing import Final
 
 from .errors import LineError, LineLostError, PortMissingError
 from .exchange import Wire
+from .gateway import STEADY
 from .throttle import LogThrottle
 from .timer import WakeTimer
 
@@ -53,6 +55,8 @@ class Port:
         self._why = LineLostError("")
         """Why it was interrupted."""
         self._given_up = False
+        self._is_silent = False
+        """It was renewed because no byte came."""
         self._log = LogThrottle(opened_by_peer=wire.line.opened_by_peer)
         wire.line.on_lost = self.line_lost
 
@@ -77,7 +81,7 @@ class Port:
         self._given_up = False
         line = self._wire.line
         try:
-            await line.open()
+            await self._open_line()
         except PortMissingError:
             if not line.opened_by_peer:
                 raise
@@ -97,20 +101,32 @@ class Port:
             if self._given_up:
                 return False
             try:
-                await wire.line.open()
+                await self._open_line()
             except LineError as error:
                 _LOGGER.debug("%s: the port is still missing: %s", self.name, error)
                 if self.state is PortState.INTERRUPTED:
                     self._lost(self._why)
                 continue
             self._opened()
+            await self._ask_gateway()
             return True
+
+    async def _ask_gateway(self) -> None:
+        """Ask a network adapter that has never passed on a frame what it speaks."""
+        wire = self._wire
+        if not (self._is_silent and wire.line.is_network):
+            return
+        self._is_silent = False
+        if not wire.gateway.ever_understood:
+            with suppress(LineError):
+                await wire.ask_gateway()
 
     async def renew(self) -> None:
         """Close a line on which no byte comes any more; it is opened anew at once."""
         _LOGGER.debug("%s: no reply any more, the port is opened anew", self.name)
         wire = self._wire
         wire.recovery.renewed()
+        self._is_silent = True
         wire.statistics.renewed += 1
         error = LineLostError("no reply any more, the port is opened anew")
         self._interrupted(error)
@@ -128,6 +144,10 @@ class Port:
 
     def line_lost(self, error: LineLostError) -> None:
         """Take note that the line is gone, by no act of ours."""
+        self._wire.gateway.lost(asyncio.get_running_loop().time())
+        if self.state is not PortState.OPEN:
+            # While it was being opened: that attempt has failed.
+            return
         if self._wire.recovery.worked and not self._wire.line.opened_by_peer:
             # Some adapters close an idle connection: it is opened again at once, and
             # a charger that then answers was never unavailable.
@@ -137,6 +157,17 @@ class Port:
             self.on_closed(error)
             self._lost(error)
         self._timer.wake()
+
+    async def _open_line(self) -> None:
+        """Open the line; raises LineError."""
+        wire, loop = self._wire, asyncio.get_running_loop()
+        await wire.line.open()
+        wire.gateway.opened(loop.time())
+        if wire.gateway.suspected:
+            await asyncio.sleep(STEADY)
+            if not wire.line.is_open:
+                message = f"{self.name} was closed as soon as it was open"
+                raise LineLostError(message)
 
     def _opened(self) -> None:
         before = self.state

@@ -35,3 +35,5 @@ class ScanResult:
     """Chargers with a firmware that cannot be used in this way."""
     other_master: bool = False
     """Another master is active on this line; nothing was sent."""
+    gateway: bool = False
+    """The adapter speaks Modbus TCP, and passes nothing on."""

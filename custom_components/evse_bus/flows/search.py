@@ -141,6 +141,7 @@ async def async_search(
         unreadable=any(result.unreadable for result in results),
         unsupported=tuple(one for result in results for one in result.unsupported),
         other_master=any(result.other_master for result in results),
+        gateway=bus.wire.gateway.detected,
     )
 
 

@@ -140,17 +140,19 @@ class ChargerSteps[
         return self.async_show_progress_done(next_step_id=self._step_after_scan())
 
     def _step_after_scan(self) -> str:
-        if self._result.other_master:
-            return "other_master"
-        if self._result.duplicates:
-            return "duplicates"
-        if self._result.unsupported:
-            return "unsupported"
-        if self._new():
-            return "select"
-        if self._result.found:
-            return "nothing_new"
-        return "unreadable" if self._result.unreadable else "nothing_found"
+        result = self._result
+        steps = {
+            "other_master": result.other_master,
+            "modbus_tcp": result.gateway,
+            "duplicates": result.duplicates,
+            "unsupported": result.unsupported,
+            "select": self._new(),
+            "nothing_new": result.found,
+            "unreadable": result.unreadable,
+        }
+        return next(
+            (step for step, applies in steps.items() if applies), "nothing_found"
+        )
 
     def _new(self) -> list[FoundCharger]:
         return [one for one in self._result.found if self._holder_of(one) is None]
@@ -178,6 +180,13 @@ class ChargerSteps[
     ) -> ResultT:
         """Report that no charger answered, and offer what to try."""
         return self._menu("nothing_found")
+
+    async def async_step_modbus_tcp(
+        self,
+        user_input: dict[str, Any] | None = None,  # noqa: ARG002
+    ) -> ResultT:
+        """Report an adapter that speaks Modbus TCP and passes nothing on."""
+        return self._menu("modbus_tcp")
 
     async def async_step_nothing_new(
         self,
