@@ -71,7 +71,7 @@ CASES: Final = {
     "abl": AblScene,
     "evbox": EvboxScene,
     "smartevse 2.17": partial(PolledScene, dialect="2.17"),
-    "smartevse later": partial(PolledScene, dialect="later"),
+    "smartevse 2.30": partial(PolledScene, dialect="2.30"),
     "smartevse slaves": SlaveScene,
     "ews": EwsScene,
 }

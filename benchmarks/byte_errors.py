@@ -81,7 +81,7 @@ CASES: Final = {
     "evbox 69": partial(EvboxScene, command=69, any_serial=True),
     "smartevse 2.17": partial(PolledScene, dialect="2.17"),
     "smartevse 2.20": partial(PolledScene, dialect="2.20"),
-    "smartevse later": partial(PolledScene, dialect="later"),
+    "smartevse 2.30": partial(PolledScene, dialect="2.30"),
     "smartevse slaves": SlaveScene,
     "ews rs-232": EwsScene,
     "ews network": EwsNetworkScene,

@@ -76,7 +76,7 @@ CASES: Final = {
     "evbox": EvboxScene,
     "smartevse 2.17": partial(PolledScene, dialect="2.17"),
     "smartevse 2.20": partial(PolledScene, dialect="2.20"),
-    "smartevse later": partial(PolledScene, dialect="later"),
+    "smartevse 2.30": partial(PolledScene, dialect="2.30"),
     "smartevse slaves": SlaveScene,
     "ews network": EwsNetworkScene,
 }

@@ -11,14 +11,14 @@ from .setup import settled, smartevse_bus
 
 NAME = "smartevse-polled"
 METHOD = """\
-One virtual SmartEVSE of each dialect (2.17, 2.20, later), load balancing off, a car
+One virtual SmartEVSE of each dialect of v2, load balancing off, a car
 charging all the time; each in a process of its own on a pty of its own paced at 9600
 8N1, all three at the same time; library alone. 6 A and 16 A in turn at random moments;
 time from the call until the pilot of the box has the new current (by the box's own
 record), and until the call returns, when the new current was read back. A box follows
-with its own cycle of 2 s; a later one needs 6.5 s without a request before that."""
+with its own cycle of 2 s; from 2.30 on it needs 6.5 s without a request before that."""
 
-UNITS: Final = {"2.17": 0, "2.20": 1, "later": 1}
+UNITS: Final = {"2.17": 0, "2.20": 0, "2.30": 1, "2.30+": 1}
 """The unit of a box of each dialect."""
 
 

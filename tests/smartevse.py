@@ -7,7 +7,7 @@ import pytest
 from tests.virtual import Car, SmartEvse
 
 LIBRARY = "custom_components.evse_bus.evse.smartevse."
-ACCESS = {"2.17": 0xA7, "2.20": 0xA7, "later": 0x0005}
+ACCESS = {"2.17": 0xA7, "2.20": 0xA7, "2.30": 0x0005, "2.30+": 0x0005}
 """The register of the access bit."""
 
 

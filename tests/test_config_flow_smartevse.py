@@ -45,7 +45,7 @@ async def test_each_way_says_what_happens_without_home_assistant(
 
 @pytest.mark.parametrize(
     ("dialect", "unit", "serial"),
-    [("2.17", 0, None), ("2.20", 0, None), ("2.20", 1, None), ("later", 1, "4711")],
+    [("2.17", 0, None), ("2.20", 0, None), ("2.20", 1, None), ("2.30", 1, "4711")],
 )
 async def test_box_is_found_in_each_dialect(
     hass: HomeAssistant, dialect: str, unit: int, serial: str | None

@@ -80,15 +80,15 @@ async def test_evbox(hass: HomeAssistant) -> None:
 
 
 async def test_smartevse(hass: HomeAssistant) -> None:
-    box = SmartEvse("later", serial=0x7A69)
+    box = SmartEvse("2.30+", serial=0x7A69)
     async with running(hass, box) as (entry, _):
         await get_entity(hass, "sensor", entry, "1_status")
         await wait_until(hass, lambda: entry.subentries["smartevse1"].data["serial"])
         data = await diagnostics(hass, entry)
         charger = data["chargers"][0]
         assert charger["config"]["address"] == 1
-        assert charger["info"]["firmware"] == "later than 2.20"
-        assert charger["reading"]["details"]["dialect"] == "later"
+        assert charger["info"]["firmware"] == "2.30, development version"
+        assert charger["reading"]["details"]["dialect"] == "2.30+"
         assert charger["config"]["serial"] == "**REDACTED**"
         assert data["master"] is None
         frames = [frame["hex"] for frame in data["frames"]]

@@ -71,7 +71,7 @@ def boxes(protocol: str) -> tuple[Device, str, str]:
         return EvboxChargePoint(1923054, 2, min_interval=0), "sensor", "2_energy"
     if protocol == "smartevse":
         # Everything that a SmartEVSE can have.
-        box = SmartEvse("later", mode=1)
+        box = SmartEvse("2.30+", mode=1)
         return box, "select", "setting_mode_at_start"
     if protocol in ("ews", "ews_network"):
         # A lock, cards and keys; ventilation has no condition.

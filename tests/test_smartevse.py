@@ -28,7 +28,8 @@ from tests.virtual import SmartEvse
     [
         ("2.17", "2.17", 3),
         ("2.20", "2.20", len(Setting)),
-        ("later", "later than 2.20", len(Setting)),
+        ("2.30", "2.30", len(Setting)),
+        ("2.30+", "2.30, development version", len(Setting)),
     ],
 )
 @pytest.mark.usefixtures("all_entities_enabled")
@@ -48,7 +49,7 @@ async def test_what_a_dialect_has(
             for one in er.async_entries_for_config_entry(er.async_get(hass), "bus")
         }
         assert sum(key.startswith("setting_") for key in keys) == settings
-        assert ("temperature" in keys) == (dialect == "later")
+        assert ("temperature" in keys) == dialect.startswith("2.30")
         assert not {"shared_supply", "second_master"} & {
             key.removeprefix("bus_") for key in keys
         }
@@ -195,7 +196,7 @@ async def test_a_mode_that_cannot_be_changed_says_why(hass: HomeAssistant) -> No
 
 
 async def test_settings_are_disabled_at_first(hass: HomeAssistant) -> None:
-    async with running(hass, SmartEvse("later")):
+    async with running(hass, SmartEvse("2.30+")):
 
         def settings() -> list[er.RegistryEntry]:
             known = er.async_get(hass)
@@ -271,7 +272,7 @@ async def test_signed_settings(
     hass: HomeAssistant, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shorten_quiet(monkeypatch)
-    box = SmartEvse("later")
+    box = SmartEvse("2.30+")
     async with running(hass, box, time_scale=10) as (entry, _):
         start = await get_entity(hass, "number", entry, "setting_solar_start_current")
         attributes = hass.states.get(start).attributes
@@ -317,7 +318,7 @@ async def test_another_device_answers(hass: HomeAssistant) -> None:
 async def test_at_address_0_others_would_hear_what_it_is_told(
     hass: HomeAssistant,
 ) -> None:
-    box, other = SmartEvse(), SmartEvse("2.20")
+    box, other = SmartEvse(), SmartEvse("2.20", unit=1)
     async with running(hass, box, other) as (entry, _):
         problem = await get_entity(hass, "binary_sensor", entry, "problem")
         await wait_for_state(hass, problem, "on")

@@ -122,14 +122,14 @@ async def test_slave_that_is_there_already_is_refused(hass: HomeAssistant) -> No
 
 
 async def test_slave_with_another_firmware_is_told(hass: HomeAssistant) -> None:
-    with VirtualBus.in_loop(slave(2), SmartEvse("later", load_balance=3)) as bus:
+    with VirtualBus.in_loop(slave(2), SmartEvse("2.30+", load_balance=3)) as bus:
         entry = await master_bus(hass, bus.url, 2)
         flow = await Flow.add_charger(hass, entry)
         await flow.choose("scan")
         await flow.wait()
         assert flow.step == "unsupported"
         assert flow.result["menu_options"] == ["scan", "manual"]
-        assert flow.tells("firmware later than 2.20")
+        assert flow.tells("firmware 2.30")
         flow.abort()
         await take_down(hass, entry)
 
@@ -224,7 +224,7 @@ async def test_box_is_searched_on_a_bus_that_has_lost_its_own(
 
 
 async def test_polled_box_is_changed_in_place(hass: HomeAssistant) -> None:
-    box = SmartEvse("later", serial=4711)
+    box = SmartEvse("2.30+", serial=4711)
     with VirtualBus.in_loop(box) as bus:
         stored = stored_charger("smartevse", 1, serial="4711", title="Box")
         entry = await setup_bus(hass, "smartevse", bus.url, stored)

@@ -273,7 +273,7 @@ def _smartevse(add: Callable[..., object]) -> None:
         type=int,
         default=1,
         metavar="N",
-        help="of the first box; dialect later only",
+        help="of the first box; from 2.30 on",
     )
     add("--no-override", action="store_true", help="takes a current without effect")
     add("--turn-round", type=float, default=0.01, metavar="S", help="before a reply")

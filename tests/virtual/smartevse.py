@@ -27,7 +27,7 @@ SPREAD = 0.004
 class SmartEvse(Device):
     """A SmartEVSE; `controller` handles its frames, `outlet` has its states.
 
-    - `dialect`: "2.17", "2.20" or "later"; `load_balance`: 0 off, 1 master, else a
+    - `dialect`: a key of `DIALECTS`; `load_balance`: 0 off, 1 master, else a
       slave and its unit; `unit`: its address with load balancing off, if not the
       default of the dialect
     - `config`: "socket" (with a `cable` of 13, 16, 32 or 63 A) or "fixed"
@@ -41,7 +41,7 @@ class SmartEvse(Device):
 
     def __init__(
         self,
-        dialect: Literal["2.17", "2.20", "later"] = "2.17",
+        dialect: str = "2.17",
         *,
         load_balance: int = 0,
         car: Car | None = None,

@@ -191,7 +191,9 @@ class SmartEvseController:
         out = self.outlet
         if isinstance(item, Setting):
             return out.settings[item.name]
-        maximum = min(out.settings["max_current"], out.cable_measured)
+        maximum = out.cable_measured
+        if not self.dialect.reports_cable:
+            maximum = min(out.settings["max_current"], maximum)
         values = {
             "state": self.dialect.states[out.state],
             "error": out.error,

@@ -1,4 +1,4 @@
-"""The registers of the three SmartEVSE dialects, as tables.
+"""The registers of the SmartEVSE v2 dialects, as tables.
 
 The C and E tables of the manual do not match the recorded firmware; the order here is
 that of the recording.
@@ -52,7 +52,9 @@ class Dialect:
 
     `unit_when_disabled`: its address without load balancing; `gentle`: it stops the car
     by the pilot (C1, B1) before it opens the contactor; `external_master`: requests of
-    another master stop its own cycle; `balance_register`: for the charge currents that
+    another master stop its own cycle; `reports_cable`: its maximum is that of the cable
+    alone; `measures`: it searches for the smallest current of each car first, and
+    ignores the override meanwhile; `balance_register`: for the charge currents that
     a master broadcasts; `silent`: write-only registers without a reply.
     """
 
@@ -68,6 +70,8 @@ class Dialect:
     gentle: bool = False
     external_master: bool = False
     status_writable: bool = True
+    reports_cable: bool = False
+    measures: bool = False
 
     def find(self, register: int, count: int) -> tuple[str | Setting, ...] | None:
         """Return the items of these registers, or None for an unmapped one."""
@@ -96,7 +100,8 @@ CONFIG = Setting("config", 0, 1)
 MIN_CURRENT = Setting("min_current", 6, 16, 6)
 MAX_CURRENT = Setting("max_current", 6, 80, 13)
 LOCK = Setting("lock", 0, 2)
-STOP_TIME = Setting("stop_time", 0, 60)
+STOP_TIME = Setting("stop_time", 0, 60, 10)
+STOP_TIME_2_17 = Setting("stop_time", 0, 60)
 SWITCH = Setting("switch", 0, 4)
 RC_MONITOR = Setting("rc_monitor", 0, 1)
 MODE = Setting("mode", 0, 2)
@@ -165,7 +170,7 @@ V2_17 = Dialect(
                 Setting("circuit", 10, 80, 16),
                 LOCK,
                 Setting("start_current", 1, 16, 4),
-                STOP_TIME,
+                STOP_TIME_2_17,
                 Setting("import_current", 0, 6),
                 SWITCH,
             ),
@@ -194,7 +199,7 @@ V2_17 = Dialect(
 V2_20 = Dialect(
     name="2.20",
     functions=(READ_HOLDING, READ_INPUT, WRITE_ONE, WRITE_SEVERAL),
-    unit_when_disabled=1,
+    unit_when_disabled=0,
     broadcast_unit=9,
     balance_register=0x01,
     units=8,
@@ -255,8 +260,96 @@ V2_20 = Dialect(
     silent=frozenset({0x01}),
 )
 
-LATER = Dialect(
-    name="later",
+_STATUS_LATER = Block(
+    0x0000,
+    (
+        "state",
+        "error",
+        "current",
+        "mode_now",
+        "solar_timer",
+        "access",
+        "config_changed",
+        "maximum",
+        "phases",
+        "real_current",
+        "temperature",
+        "serial",
+    ),
+)
+_BOX_LATER = Block(
+    0x0100,
+    (
+        CONFIG,
+        LOCK,
+        MIN_CURRENT,
+        MAX_CURRENT,
+        Setting("load_balance", 0, 8),
+        SWITCH,
+        RC_MONITOR,
+        Setting("rfid", 0, 5),
+        *_meter("ev", 12, 9, 10),
+    ),
+)
+
+
+def _system_later(start: Setting, imported: Setting, *more: Setting) -> Block:
+    return Block(
+        0x0200,
+        (
+            MODE,
+            Setting("circuit", 10, 160, 16),
+            GRID,
+            Setting("calibration", 307, 2048, 1024),
+            Setting("mains", 10, 200, 25),
+            start,
+            STOP_TIME,
+            imported,
+            Setting("mains_meter", 1, 9, 0),
+            Setting("mains_address", 10, 247, 10),
+            MEASURES,
+            *_meter("pv", 11, 9, 10),
+            ORDER,
+            Setting("custom_type", 0, 2),
+            Setting("custom_function", 3, 4, 4),
+            *_custom(
+                "voltage",
+                "voltage_divisor",
+                "current",
+                "current_divisor",
+                "power",
+                "power_divisor",
+                "energy",
+                "energy_divisor",
+            ),
+            Setting("custom_longest", 3, 255, 0),
+            *more,
+        ),
+    )
+
+
+V2_30 = Dialect(
+    name="2.30",
+    functions=(READ_HOLDING, READ_INPUT, WRITE_ONE, WRITE_SEVERAL),
+    unit_when_disabled=1,
+    broadcast_unit=9,
+    balance_register=0x20,
+    units=8,
+    states={name: index for index, name in enumerate(_LATER_STATES[:9])},
+    blocks=(
+        _STATUS_LATER,
+        _BOX_LATER,
+        _system_later(
+            Setting("start_current", 1, 16, 4), Setting("import_current", 0, 6, 0)
+        ),
+    ),
+    silent=frozenset(),
+    external_master=True,
+    reports_cable=True,
+)
+
+HEAD = Dialect(
+    name="2.30+",
     functions=(READ_HOLDING, READ_INPUT, WRITE_ONE, WRITE_SEVERAL),
     unit_when_disabled=1,
     broadcast_unit=9,
@@ -264,75 +357,20 @@ LATER = Dialect(
     units=8,
     states={name: index for index, name in enumerate(_LATER_STATES)},
     blocks=(
-        Block(
-            0x0000,
-            (
-                "state",
-                "error",
-                "current",
-                "mode_now",
-                "solar_timer",
-                "access",
-                "config_changed",
-                "maximum",
-                "phases",
-                "real_current",
-                "temperature",
-                "serial",
-            ),
-        ),
-        Block(
-            0x0100,
-            (
-                CONFIG,
-                LOCK,
-                MIN_CURRENT,
-                MAX_CURRENT,
-                Setting("load_balance", 0, 8),
-                SWITCH,
-                RC_MONITOR,
-                Setting("rfid", 0, 5),
-                *_meter("ev", 12, 9, 10),
-            ),
-        ),
-        Block(
-            0x0200,
-            (
-                MODE,
-                Setting("circuit", 10, 160, 16),
-                GRID,
-                Setting("calibration", 307, 2048, 1024),
-                Setting("mains", 10, 200, 25),
-                # Ampere + 16, minutes, ampere + 48.
-                Setting("start_current", 0, 32, 12),
-                STOP_TIME,
-                Setting("import_current", 0, 96, 48),
-                Setting("mains_meter", 1, 9, 0),
-                Setting("mains_address", 10, 247, 10),
-                MEASURES,
-                *_meter("pv", 11, 9, 10),
-                ORDER,
-                Setting("custom_type", 0, 2),
-                Setting("custom_function", 3, 4, 4),
-                *_custom(
-                    "voltage",
-                    "voltage_divisor",
-                    "current",
-                    "current_divisor",
-                    "power",
-                    "power_divisor",
-                    "energy",
-                    "energy_divisor",
-                ),
-                Setting("custom_longest", 3, 255, 3),
-                Setting("wifi", 0, 2),
-                Setting("capacity", 9, 200, 9),
-            ),
+        _STATUS_LATER,
+        _BOX_LATER,
+        _system_later(
+            # Ampere + 16, ampere + 48.
+            Setting("start_current", 0, 32, 12),
+            Setting("import_current", 0, 96, 48),
+            Setting("wifi", 0, 2),
+            Setting("capacity", 9, 200, 9),
         ),
     ),
     silent=frozenset(),
     gentle=True,
     external_master=True,
+    measures=True,
 )
 
-DIALECTS = {dialect.name: dialect for dialect in (V2_17, V2_20, LATER)}
+DIALECTS = {dialect.name: dialect for dialect in (V2_17, V2_20, V2_30, HEAD)}

@@ -35,6 +35,8 @@ START_TIMEOUT = 5
 ACTIVATION_AFTER = 30
 ACTIVATION_TIME = 3
 LOWEST_PWM, HIGHEST_PWM = 60, 800
+# HEAD, since its first cycle in C (recorded in `first_minutes`): until when, 0.1 A.
+MEASUREMENT = ((40, 60), (50, 80), (56, 60), (66, 80), (72, 60), (82, 80))
 UNPLUGGED, CONNECTED, CHARGING = 12, 9, 6
 NEVER = 255
 
@@ -74,6 +76,8 @@ class SmartEvseStates:
         self.pilot_voltage: int | None = None
         self.temperature = 20
         self.rcd_tripped = False
+        # False: the car's smallest current is known already.
+        self.measures = dialect.measures
         self.meter_works = True
         self.meter_leaves = 80.0
         self.switch_closed = True
@@ -115,6 +119,7 @@ class SmartEvseStates:
         self._second_at: float | None = None
         self._cycle_at: float | None = None
         self._c1_timer = 0
+        self._measured_from: float | None = None
         self._activation = NEVER
         self._activation_timer = 0
         self.open_access()
@@ -257,6 +262,7 @@ class SmartEvseStates:
             self.error &= ~(NO_SUN | LESS_6A)
             self.charge_delay = 0
             self._next = ""
+            self._measured_from = None
             return
         ready = self.access and not self.error and not self.charge_delay
         if self.state == "F" or pilot != CONNECTED or not ready:
@@ -363,4 +369,15 @@ class SmartEvseStates:
         elif self.settings["mode"] != NORMAL:
             charge = min(charge, int(self.meter_leaves * 10))
         if self.state == "C":
-            self.current = charge
+            measured = self._measurement()
+            self.current = charge if measured is None else measured
+
+    def _measurement(self) -> int | None:
+        """Return the current while the smallest one of a car is searched, 0.1 A."""
+        if not self.measures or self.slave or self._now is None:
+            return None
+        if self._measured_from is None:
+            self._measured_from = self._now
+            return None
+        elapsed = self._now - self._measured_from
+        return next((one for until, one in MEASUREMENT if elapsed < until), None)

@@ -117,7 +117,7 @@ def test_smartevse(tmp_path: Path) -> None:
 
 
 def test_smartevse_dialects() -> None:
-    arguments = ["--dialect", "later", "--serial", "77"]
+    arguments = ["--dialect", "2.30", "--serial", "77"]
     with (
         running("smartevse", *arguments) as (_, url),
         RawClient(url, "N", termios.B9600) as client,

@@ -12,9 +12,10 @@ BURST_GAP = 0.1
 NO_COMM = 2
 
 
-def charging(dialect: str = "later", car: Car | None = None) -> SmartEvseAlone:
+def charging(dialect: str = "2.30+", car: Car | None = None) -> SmartEvseAlone:
     alone = SmartEvseAlone(dialect, car or Car())
     assert alone.outlet.car
+    alone.outlet.measures = False
     alone.outlet.car.plug_in()
     alone.live(6)
     assert alone.state == "C"
@@ -25,25 +26,24 @@ def charging(dialect: str = "later", car: Car | None = None) -> SmartEvseAlone:
 def test_status_of_220(function: int) -> None:
     alone = SmartEvseAlone("2.20", Car(), max_current=20, cable=32)
     assert alone.read(0xA0, 12, function) == [0, 0, 0, 6, 0, 0, 0, 1, 0, 0, 12, 0]
-    assert alone.receive(read_frame(0, 0xA0, 12)) is None
+    assert alone.receive(read_frame(1, 0xA0, 12)) is None
     assert alone.read(0xC0, 4) == [0, 0, 6, 20]
     assert alone.read(0xE0, 3) == [16, 0, 25]
-    assert alone.receive(read_frame(1, 0xAC, 1)) == frame(1, 4, b"\x02")
-    assert SmartEvseAlone("2.20", unit=0).receive(read_frame(0, 0xA0, 12))
+    assert alone.receive(read_frame(0, 0xAC, 1)) == frame(0, 4, b"\x02")
 
 
 @pytest.mark.parametrize("function", [3, 4])
 def test_status_of_later(function: int) -> None:
-    alone = SmartEvseAlone("later", Car(), serial=4711)
+    alone = SmartEvseAlone("2.30+", Car(), serial=4711)
     want = [0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 293, 4711]
     assert alone.read(0x0000, 12, function) == want
     assert alone.receive(read_frame(1, 0xA0, 9)) == frame(1, 4, b"\x02")
     assert alone.read(0x0100, 5) == [0, 0, 6, 13, 0]
-    assert alone.read(0x0200, 8) == [0, 16, 0, 1024, 25, 12, 0, 48]
+    assert alone.read(0x0200, 8) == [0, 16, 0, 1024, 25, 12, 10, 48]
 
 
 @pytest.mark.parametrize(
-    ("dialect", "current", "access"), [("2.20", 0xA6, 0xA7), ("later", 2, 5)]
+    ("dialect", "current", "access"), [("2.20", 0xA6, 0xA7), ("2.30+", 2, 5)]
 )
 def test_writes(dialect: str, current: int, access: int) -> None:
     alone = charging(dialect)
@@ -90,7 +90,7 @@ def test_a_car_that_does_not_stop_has_six_seconds() -> None:
 
 
 def test_volatile_mode_is_answered_and_ignored() -> None:
-    alone = SmartEvseAlone("later", mode=1)
+    alone = SmartEvseAlone("2.30+", mode=1)
     assert alone.write(3, 2) == "ok"
     assert alone.read(3) == [1]
 
@@ -136,7 +136,7 @@ def test_override_needs_its_own_cycle() -> None:
 
 def test_polled_all_the_time_a_car_gets_no_pwm() -> None:
     car = Car()
-    alone = SmartEvseAlone("later", car)
+    alone = SmartEvseAlone("2.30+", car)
     alone.live(3)
     alone.read(0, 12)
     car.plug_in()
@@ -148,7 +148,7 @@ def test_polled_all_the_time_a_car_gets_no_pwm() -> None:
 
 
 def test_stored_settings() -> None:
-    alone = SmartEvseAlone("later")
+    alone = SmartEvseAlone("2.30+")
     alone.write(5, 0)
     assert alone.write(0x0103, 81) == "refused 3"
     assert alone.write(0x0103, 32) == "ok"
@@ -158,7 +158,7 @@ def test_stored_settings() -> None:
 
 
 @pytest.mark.parametrize(
-    ("dialect", "register", "after"), [("2.20", 1, "A"), ("later", 0x20, "C1")]
+    ("dialect", "register", "after"), [("2.20", 1, "A"), ("2.30+", 0x20, "C1")]
 )
 def test_slaves_follow_unit_9(dialect: str, register: int, after: str) -> None:
     """They wait to be polled, and a broadcast of 0 is a stop."""
@@ -185,3 +185,22 @@ def test_slaves_follow_unit_9(dialect: str, register: int, after: str) -> None:
     assert alone.outlet.pilot_current == 10.0
     broadcast(0)
     assert alone.state == after
+
+
+def test_head_searches_for_the_smallest_current_of_each_car() -> None:
+    """As recorded in `first_minutes`: 13 A for a second, then 6 and 8 A in turn."""
+    car = Car()
+    alone = SmartEvseAlone("2.30+", car)
+    assert alone.write(2, 70) == "ok"
+    alone.live(9)
+    for _ in range(2):
+        car.plug_in()
+        begin = alone.now
+        seen: list[float] = []
+        while alone.now < begin + 100:
+            alone.live(0.5)
+            if alone.state == "C" and seen[-1:] != [alone.outlet.pilot_current]:
+                seen.append(alone.outlet.pilot_current)
+        assert seen == [13.0, 6.0, 8.0, 6.0, 8.0, 6.0, 8.0, 7.0]
+        car.leave()
+        alone.live(5)

@@ -20,9 +20,12 @@ from tests.virtual.smartevse_registers import DIALECTS
 
 from .scene import Box, SmartEvseLine
 
-ALL = tuple(Dialect)
 OLDER = (Dialect.V2_17, Dialect.V2_20)
-LATER = Dialect.LATER
+LATER = (Dialect.V2_30, Dialect.V2_HEAD)
+ALL = OLDER + LATER
+"""The dialects that can be polled without load balancing."""
+V2_30 = Dialect.V2_30
+HEAD = Dialect.V2_HEAD
 V2_17 = Dialect.V2_17
 V2_20 = Dialect.V2_20
 
@@ -57,6 +60,8 @@ class PolledScene(LiveScene):
     poll_interval: float = 2.0
     settings: dict[str, int] = field(default_factory=dict)
     override_works: bool = True
+    measures: bool = False
+    """HEAD searches for the smallest current of each car."""
     line: SmartEvseLine = field(init=False)
     car: Car = field(init=False)
     box: Box = field(init=False)
@@ -99,6 +104,7 @@ class PolledScene(LiveScene):
             unit=self.unit,
             override_works=self.override_works,
         )
+        controller.outlet.measures &= self.measures
         return Box(controller, self.car)
 
     def make_charger(self, key: str = "box") -> PolledSmartEvse:
@@ -185,7 +191,7 @@ class PolledScene(LiveScene):
         return 0 < self.box.offers <= ceiling
 
     async def polled(self, times: int = 2) -> None:
-        pause = max(self.poll_interval, QUIET if self.dialect is LATER else 0.0)
+        pause = max(self.poll_interval, QUIET if self.dialect in LATER else 0.0)
         await asyncio.sleep(times * (pause + 0.5))
 
     @override

@@ -129,7 +129,7 @@ def test_other_frames_are_not_taken_for_a_master(head: str) -> None:
     simulate(scene())
 
 
-@pytest.mark.parametrize("dialect", ["2.20", "later"])
+@pytest.mark.parametrize("dialect", ["2.20", "2.30", "2.30+"])
 def test_another_dialect_is_not_written_to(dialect: str) -> None:
     async def scene() -> None:
         async with MasterScene(units=(2,)) as scene:
@@ -155,7 +155,7 @@ def test_a_scan_only_reads_and_reports_unsupported_boxes() -> None:
     async def scene() -> None:
         async with MasterScene(units=()) as scene:
             scene.plug_box(2)
-            scene.plug_box(4, "later")
+            scene.plug_box(4, "2.30+")
             begin = now()
             report = await scan(scene.bus, scene)
             assert [one.address for one in report.found] == [2]

@@ -22,8 +22,24 @@ from custom_components.evse_bus.evse.smartevse import POLLED
 from custom_components.evse_bus.evse.smartevse.dialects import Dialect
 from tests.simulated_time import now, simulate
 
-from .polled_scene import ALL, LATER, OLDER, V2_17, V2_20, PolledScene, play
+from .polled_scene import (
+    ALL,
+    HEAD,
+    LATER,
+    OLDER,
+    V2_17,
+    V2_20,
+    V2_30,
+    PolledScene,
+    play,
+)
 
+FIRMWARE = {
+    V2_17: "2.17",
+    V2_20: "2.20",
+    V2_30: "2.30",
+    HEAD: "2.30, development version",
+}
 each = pytest.mark.parametrize("dialect", ALL)
 older = pytest.mark.parametrize("dialect", OLDER)
 
@@ -43,6 +59,7 @@ def test_the_dialect_is_found_by_reading(dialect: Dialect) -> None:
 @each
 def test_no_car(dialect: Dialect) -> None:
     async def acts(scene: PolledScene) -> None:
+        await asyncio.sleep(20)
         assert scene.connector.status is Status.AVAILABLE
         assert scene.connector.raw_state == "A"
         assert scene.connector.plugged is False
@@ -52,8 +69,8 @@ def test_no_car(dialect: Dialect) -> None:
         assert scene.reading.maximum_current == 16
         assert scene.reading.mode is Mode.NORMAL
         has = Capability.TEMPERATURE in scene.charger.capabilities
-        assert has == (dialect is LATER)
-        assert scene.reading.temperature == (20 if dialect is LATER else None)
+        assert has == (dialect in LATER)
+        assert scene.reading.temperature == (20 if dialect in LATER else None)
 
     play(PolledScene(dialect), acts)
 
@@ -102,7 +119,7 @@ def test_a_limit_is_confirmed_by_its_read_back(
         await scene.charger.change_orders(OrderChange(current=amperes))
         assert scene.box.offers == amperes
         assert scene.reading.offered_current == amperes
-        assert now() - began < (14 if dialect is LATER else 3.5)
+        assert now() - began < (14 if dialect in LATER else 3.5)
 
     play(PolledScene(dialect), acts)
 
@@ -143,6 +160,50 @@ def test_without_access_an_older_box_hides_the_car(dialect: Dialect) -> None:
     play(PolledScene(dialect), acts)
 
 
+@pytest.mark.parametrize("dialect", [V2_17, V2_20, V2_30])
+@pytest.mark.parametrize("plugged", [True, False])
+def test_after_off_and_on_a_car_that_keeps_its_request_is_not_gone(
+    dialect: Dialect, *, plugged: bool
+) -> None:
+    """The box reports A until the car has let go once: that is no "unplugged"."""
+
+    async def acts(scene: PolledScene) -> None:
+        if plugged:
+            await scene.charge()
+        await scene.charger.change_orders(OrderChange(allowed=False))
+        scene.outlet.pilot_voltage = 6 if plugged else None
+        await scene.charger.change_orders(OrderChange(allowed=True))
+        await asyncio.sleep(600)
+        assert scene.connector.raw_state == "A"
+        assert scene.connector.plugged is None
+        scene.outlet.pilot_voltage = 9
+        await scene.until(lambda: scene.connector.plugged is True)
+        scene.outlet.pilot_voltage = 12
+        await scene.until(lambda: scene.connector.plugged is False)
+
+    play(PolledScene(dialect), acts)
+
+
+@each
+def test_right_after_power_up_a_plugged_car_is_not_gone(dialect: Dialect) -> None:
+    async def acts(scene: PolledScene) -> None:
+        await scene.charge()
+        seen: list[bool | None] = []
+        scene.on_step.append(lambda: seen.append(_plugged(scene)))
+        scene.box.controller.power_cycle()
+        await scene.until(lambda: scene.box.state == "C", 60)
+        assert False not in seen
+        scene.car.leave()
+        await scene.until(lambda: _plugged(scene) is False, 60)
+
+    play(PolledScene(dialect), acts)
+
+
+def _plugged(scene: PolledScene) -> bool | None:
+    reading = scene.charger.reading
+    return None if reading is None else reading.connectors[1].plugged
+
+
 def test_without_access_a_later_box_still_reports_the_car() -> None:
     async def acts(scene: PolledScene) -> None:
         await scene.charge()
@@ -155,7 +216,7 @@ def test_without_access_a_later_box_still_reports_the_car() -> None:
         assert scene.connector.charging is False
         assert scene.connector.status is Status.SUSPENDED_EVSE
 
-    play(PolledScene(LATER), acts)
+    play(PolledScene(HEAD), acts)
 
 
 @each
@@ -255,7 +316,7 @@ def test_a_box_that_loses_its_override_gets_it_again(dialect: Dialect) -> None:
         scene.outlet.override = 0
         await scene.until(lambda: scene.outlet.pilot_current > 10)
         took = await scene.until(lambda: scene.box.offers == 10)
-        assert took < (14 if dialect is LATER else 7)
+        assert took < (14 if dialect in LATER else 7)
         assert scene.charger.statistics.reasserted >= 1
 
     play(PolledScene(dialect), acts)
@@ -366,7 +427,7 @@ def test_an_error_is_a_fault() -> None:
 
 def test_the_serial_number_is_checked() -> None:
     async def run_wrong() -> PolledScene:
-        scene = PolledScene(LATER, expected="815")
+        scene = PolledScene(HEAD, expected="815")
         async with scene:
             await scene.until(lambda: Fault.WRONG_CHARGER in scene.charger.faults)
             await asyncio.sleep(30)
@@ -382,31 +443,31 @@ def test_the_serial_number_is_checked() -> None:
 def test_another_box_in_its_place() -> None:
     async def acts(scene: PolledScene) -> None:
         scene.serial = 815
-        scene.replace_box(LATER)
+        scene.replace_box(HEAD)
         since = now()
         await scene.until(lambda: Fault.WRONG_CHARGER in scene.charger.faults)
         await asyncio.sleep(60)
         assert scene.writes(since=since) == []
 
-    play(PolledScene(LATER), acts)
+    play(PolledScene(HEAD), acts)
 
 
 def test_a_changed_firmware_is_identified_anew() -> None:
     async def acts(scene: PolledScene) -> None:
-        scene.replace_box(LATER)
-        scene.dialect = LATER
-        await scene.until(lambda: scene.charger.dialect is LATER)
+        scene.replace_box(HEAD)
+        scene.dialect = HEAD
+        await scene.until(lambda: scene.charger.dialect in LATER)
         await scene.charge()
         await scene.polled(3)
         assert scene.box.offers == 10
 
-    play(PolledScene(V2_20), acts)
+    play(PolledScene(V2_20, unit=1), acts)
 
 
 def test_at_address_0_a_box_must_be_alone() -> None:
     async def acts(scene: PolledScene) -> None:
         since = now()
-        scene.bus.add(PolledScene(LATER).make_charger("other"))
+        scene.bus.add(PolledScene(HEAD).make_charger("other"))
         with pytest.raises(SharedAddressError):
             await scene.charger.change_orders(OrderChange(allowed=False))
         assert scene.writes(since=since) == []
@@ -517,10 +578,9 @@ def test_scan(dialect: Dialect) -> None:
             scene.bus, scene.charger.config, scene.charger.orders, shares.append
         )
         (found,) = report.found
-        assert found.address == scene.box.unit == (0 if dialect is V2_17 else 1)
-        assert found.info.firmware is not None
-        assert found.info.firmware.startswith("2.") == (dialect is not LATER)
-        assert found.serial == ("4711" if dialect is LATER else None)
+        assert found.address == scene.box.unit == (0 if dialect in OLDER else 1)
+        assert found.info.firmware == FIRMWARE[dialect]
+        assert found.serial == ("4711" if dialect in LATER else None)
         assert found.maximum_current == 16
         assert shares[0] == 0
         assert shares[-1] == 1
@@ -606,3 +666,24 @@ def test_two_boxes_with_one_address(dialect: Dialect) -> None:
         )
 
     play(PolledScene(dialect), acts)
+
+
+@pytest.mark.parametrize("lowered", [False, True])
+def test_a_search_for_the_smallest_current_is_no_disobedience(*, lowered: bool) -> None:
+    """HEAD offers 6 and 8 A in turn first; only then does it follow a limit of 6 A."""
+
+    async def acts(scene: PolledScene) -> None:
+        await scene.charge()
+        begun = now()
+        if lowered:
+            await scene.charger.change_orders(OrderChange(current=6))
+            assert now() - begun < 110
+        else:
+            await asyncio.sleep(110)
+        assert scene.outlet.state == "C"
+        assert scene.box.offers == 6
+        assert not scene.charger.faults
+        assert scene.charger.orders.limit.current == 6
+        assert len([one for one in scene.writes() if one.register == 2]) <= 3
+
+    play(PolledScene(HEAD, current=10 if lowered else 6, measures=True), acts)

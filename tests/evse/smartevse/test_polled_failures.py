@@ -19,7 +19,7 @@ from custom_components.evse_bus.evse.smartevse.dialects import MAPS, Dialect
 from custom_components.evse_bus.evse.smartevse.registers import read_request
 from tests.simulated_time import now, simulate
 
-from .polled_scene import ALL, LATER, OLDER, V2_17, V2_20, PolledScene, play
+from .polled_scene import ALL, HEAD, LATER, OLDER, V2_17, V2_20, PolledScene, play
 
 each = pytest.mark.parametrize("dialect", ALL)
 older = pytest.mark.parametrize("dialect", OLDER)
@@ -97,7 +97,7 @@ def test_access_opened_by_a_setting_is_closed_after_a_failure(
         scene.outlet.set_access(False)
         scene.car.plug_in()
         await scene.polled(2)
-        register = 0x0103 if dialect is LATER else 0xE0 if dialect is V2_17 else 0xC3
+        register = 0x0103 if dialect in LATER else 0xE0 if dialect is V2_17 else 0xC3
         request = asyncio.create_task(
             scene.charger.configure(Setting.MAXIMUM_CURRENT, 13)
         )
@@ -168,7 +168,7 @@ def test_a_reload_does_not_stop_a_later_box(
     reload: bool,  # noqa: FBT001
 ) -> None:
     async def run() -> None:
-        scene = PolledScene(LATER)
+        scene = PolledScene(HEAD)
         errors: list[int] = []
         scene.on_step.append(lambda: errors.append(scene.outlet.error))
         async with scene:
@@ -201,7 +201,7 @@ def test_a_scan_does_not_stop_a_later_box(after: float) -> None:
         await asyncio.sleep(30)
         assert not any(errors)
 
-    play(PolledScene(LATER), acts)
+    play(PolledScene(HEAD), acts)
 
 
 def test_the_fault_of_a_shared_address_is_steady() -> None:
@@ -268,7 +268,7 @@ def test_a_pause_while_a_later_box_wakes_its_car() -> None:
         assert scene.box.state == "B1"
         assert scene.box.offers == 0
 
-    play(PolledScene(LATER), acts)
+    play(PolledScene(HEAD), acts)
 
 
 @each

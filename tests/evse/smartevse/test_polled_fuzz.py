@@ -135,7 +135,12 @@ async def play(
     dialect: Dialect, steps: list[tuple[float, tuple[str, object]]], seed: int
 ) -> Oracle:
     scene = PolledScene(
-        dialect, current=10.0, installation=INSTALLATION, maximum=32, cable=32
+        dialect,
+        current=10.0,
+        installation=INSTALLATION,
+        maximum=32,
+        cable=32,
+        measures=seed % 2 == 1,
     )
     oracle = Oracle(scene)
     rng = Random(seed)  # noqa: S311 - repeatable on purpose
@@ -158,7 +163,7 @@ async def play(
         losing = False
         await asyncio.gather(*orders)
         # Long enough for an unavailable box to be found again.
-        await asyncio.sleep(45 if dialect is not LATER else 60)
+        await asyncio.sleep(45 if dialect not in LATER else 60)
         assert scene.charger.available
         standing = scene.charger.setpoint
         if standing.paused:
@@ -168,7 +173,7 @@ async def play(
             highest = max(standing.current, MINIMUM_CURRENT)
             if scene.box.offers > highest:
                 # A charge begins with the box's own maximum, until its next cycle.
-                await asyncio.sleep(15)
+                await asyncio.sleep(110 if scene.outlet.measures else 15)
             assert scene.box.offers <= highest
         assert scene.charger.orders.limit.current <= oracle.limit
         if oracle.allowed is False:

@@ -10,7 +10,7 @@ from custom_components.evse_bus.evse.smartevse.polled import QUIET
 from custom_components.evse_bus.evse.smartevse.registers import read_request
 from tests.simulated_time import now
 
-from .polled_scene import LATER, PolledScene, play
+from .polled_scene import HEAD, PolledScene, play
 
 NO_COMM = 2
 
@@ -38,7 +38,7 @@ def test_polled_without_quiet_it_stops_with_no_comm() -> None:
         await scene.charge()
         await scene.polled(2)
         await scene.bus.stop()
-        request = read_request(1, MAPS[LATER].status.block)
+        request = read_request(1, MAPS[HEAD].status.block)
         errors = 0
         await scene.line.open()
         for _ in range(8):
@@ -48,7 +48,7 @@ def test_polled_without_quiet_it_stops_with_no_comm() -> None:
         assert errors & NO_COMM
         assert scene.box.offers == 0
 
-    play(PolledScene(LATER), acts)
+    play(PolledScene(HEAD), acts)
 
 
 def test_polled_by_the_library_it_does_not_stop() -> None:
@@ -65,7 +65,7 @@ def test_polled_by_the_library_it_does_not_stop() -> None:
         assert Fault.NO_COMM not in scene.charger.faults
         assert scene.box.offers == 10
 
-    scene = play(PolledScene(LATER, poll_interval=0.5), acts)
+    scene = play(PolledScene(HEAD, poll_interval=0.5), acts)
     assert min(quiets(scene)) >= QUIET - 0.1
     # Nor is it read less often than possible.
     assert max(quiets(scene)) < QUIET + 1.0
@@ -85,7 +85,7 @@ def test_commands_wait_for_the_quiet_but_pauses_do_not() -> None:
         await scene.charger.change_orders(OrderChange(allowed=True))
         assert QUIET - 1.5 < now() - began < QUIET + 1.0
 
-    play(PolledScene(LATER), acts)
+    play(PolledScene(HEAD), acts)
 
 
 def test_requests_to_other_addresses_disturb_the_quiet_too() -> None:
@@ -95,14 +95,14 @@ def test_requests_to_other_addresses_disturb_the_quiet_too() -> None:
         await scene.charge()
 
         async def ask(turn: Turn) -> None:
-            await turn.send(read_request(5, MAPS[LATER].status.block))
+            await turn.send(read_request(5, MAPS[HEAD].status.block))
 
         for _ in range(20):
             await asyncio.sleep(9.1)
             await scene.bus.run(ask)
         assert not any(errors)
 
-    scene = play(PolledScene(LATER), acts)
+    scene = play(PolledScene(HEAD), acts)
     mine = [s.when for s in scene.line.sent if s.data[0] == 1]
     foreign = [s.when for s in scene.line.sent if s.data[0] == 5]
     for when in foreign:

@@ -32,11 +32,14 @@ from custom_components.evse_bus.evse.smartevse.dialects import (
     MAPS,
     PROBE_A0,
     PROBE_A9,
+    PROBE_HEAD,
+    PROBE_V3_OLD,
     Dialect,
     Status,
 )
 from custom_components.evse_bus.evse.smartevse.probing import find_dialect
 from custom_components.evse_bus.evse.smartevse.registers import (
+    MalformedRefusalError,
     decode_configuration,
     decode_status,
     read_answer,
@@ -48,6 +51,7 @@ from custom_components.evse_bus.evse.smartevse.registers import (
     write_setting,
 )
 from custom_components.evse_bus.evse.smartevse.states import (
+    faults_of,
     is_stopped,
     ocpp_status,
     offered,
@@ -55,7 +59,7 @@ from custom_components.evse_bus.evse.smartevse.states import (
     state_of,
 )
 
-from .polled_scene import ALL, LATER, V2_17, V2_20
+from .polled_scene import ALL, HEAD, LATER, V2_17, V2_20, V2_30
 
 each = pytest.mark.parametrize("dialect", ALL)
 LIMITS = Limits(installation=80.0)
@@ -114,7 +118,7 @@ def test_no_communication_as_recorded() -> None:
     )
     assert data is not None
     status = decode_status(V2_17, data)
-    assert status.faults == {Fault.NO_COMM}
+    assert faults_of(V2_17, status) == {Fault.NO_COMM}
     assert ocpp_status(V2_17, status) is OcppStatus.FAULTED
     assert not shows_plug(V2_17, status)
 
@@ -165,12 +169,12 @@ def test_an_impossible_address_is_refused() -> None:
 
 
 def test_mode_and_settings() -> None:
-    assert write_mode(1, LATER, Mode.SOLAR)[2:9] == bytes.fromhex("00030001020002")
-    written = write_setting(1, LATER, Setting.SOLAR_START_CURRENT, 4)
+    assert write_mode(1, HEAD, Mode.SOLAR)[2:9] == bytes.fromhex("00030001020002")
+    written = write_setting(1, HEAD, Setting.SOLAR_START_CURRENT, 4)
     assert written[2:9] == bytes.fromhex("0205000102000c")
     for value in (-17, 17):
         with pytest.raises(RefusedOrderError):
-            write_setting(1, LATER, Setting.SOLAR_START_CURRENT, value)
+            write_setting(1, HEAD, Setting.SOLAR_START_CURRENT, value)
 
 
 # -- Random bytes --------------------------------------------------------------------
@@ -188,7 +192,7 @@ def test_any_bytes_are_a_status_or_implausible(dialect: Dialect, data: bytes) ->
     current = offered(dialect, status)
     assert current is None or current == 0 or 6 <= current <= 80
     if is_stopped(dialect, status):
-        assert not status.access
+        assert status.access is False
         assert status.raw_state not in {"C", "D"}
 
 
@@ -210,10 +214,9 @@ def test_nearly_a_status(dialect: Dialect, values: list[int], more: list[int]) -
         return
     assert status.raw_state == table.words["raw_state"].kind.value(registers[0])
     assert status.current == word("current") / 10
-    assert status.access is (word("access") == 1)
-    assert word("access") in (0, 1)
-    assert word("error") < 256
-    assert word("maximum") <= 160
+    assert status.access is {0: False, 1: True}.get(word("access"))
+    assert status.error == word("error")
+    assert status.maximum is None or status.maximum == word("maximum") <= 160
 
 
 @each
@@ -272,8 +275,12 @@ A0_17 = words(0x41, 0, 0, 6, 0, 0, 0, 1, 0)
 A0_20 = words(0, 0, 0, 6, 0, 0, 0, 1, 0)
 
 
-LATER_STATUS = MAPS[LATER].status.block
-ILLEGAL_ADDRESS = ExchangeRefusedError("exception 2", 2)
+LATER_STATUS = MAPS[HEAD].status.block
+LATER_BOX = MAPS[HEAD].configuration[0]
+REFUSED = MalformedRefusalError("exception 2", 2)
+STANDARD = ExchangeRefusedError("exception 2", 2)
+BOX = words(0, 0, 6, 13, 0)
+"""0x0100 x 5 as delivered."""
 
 type Reply = bytes | ExchangeRefusedError
 
@@ -309,10 +316,21 @@ def test_a_number_alone_is_not_2_20() -> None:
     assert box.blocks == [PROBE_A0, PROBE_A9]
 
 
-def test_without_a0_it_may_be_a_later_one() -> None:
-    box = Replies(ILLEGAL_ADDRESS, later())
-    assert dialect_of(box) is LATER
-    assert box.blocks == [PROBE_A0, LATER_STATUS]
+@pytest.mark.parametrize(
+    ("dialect", "refused", "probe", "reply"),
+    [
+        (V2_30, REFUSED, PROBE_HEAD, REFUSED),
+        (HEAD, REFUSED, PROBE_HEAD, words(9)),
+        (Dialect.V3, STANDARD, PROBE_V3_OLD, STANDARD),
+        (Dialect.V3_OLD, STANDARD, PROBE_V3_OLD, words(0)),
+    ],
+)
+def test_without_a0_it_is_a_later_one(
+    dialect: Dialect, refused: Reply, probe: Block, reply: Reply
+) -> None:
+    box = Replies(refused, reply, later(), BOX)
+    assert dialect_of(box) is dialect
+    assert box.blocks == [PROBE_A0, probe, LATER_STATUS, LATER_BOX]
 
 
 @pytest.mark.parametrize("code", [1, 3, 4, None])
@@ -323,14 +341,17 @@ def test_another_refusal_is_no_smartevse(code: int | None) -> None:
 
 def test_a_number_without_a9_is_no_known_dialect() -> None:
     with pytest.raises(ImplausibleReplyError):
-        dialect_of(Replies(A0_20, ILLEGAL_ADDRESS))
+        dialect_of(Replies(A0_20, REFUSED))
 
 
 def test_a_meter_is_no_smartevse() -> None:
     """Twelve words of floating point numbers at unit 1."""
     floats = words(0x4366, 0x1999, 0x4365, 0x8000, *([0x4100] * 8))
     with pytest.raises(ImplausibleReplyError):
-        dialect_of(Replies(ILLEGAL_ADDRESS, floats))
+        dialect_of(Replies(STANDARD, STANDARD, floats, BOX))
+    with pytest.raises(ImplausibleReplyError):
+        # Or zeros everywhere.
+        dialect_of(Replies(STANDARD, words(0), bytes(24), bytes(10)))
 
 
 @given(
@@ -339,10 +360,10 @@ def test_a_meter_is_no_smartevse() -> None:
             st.none(),
             st.integers(0, 255),
             st.binary(max_size=30),
-            st.sampled_from((A0_17, A0_20, words(0, 0, 0), later())),
+            st.sampled_from((A0_17, A0_20, words(0, 0, 0), later(), BOX)),
         ),
-        min_size=2,
-        max_size=2,
+        min_size=4,
+        max_size=4,
     )
 )
 def test_a_dialect_is_found_only_by_its_own_registers(
@@ -361,7 +382,7 @@ def test_a_dialect_is_found_only_by_its_own_registers(
     except ImplausibleReplyError:
         return
     assert (PROBE_A9 in box.blocks) == (dialect is V2_20)
-    assert (LATER_STATUS in box.blocks) == (dialect is LATER)
+    assert (LATER_STATUS in box.blocks) == (dialect in LATER)
 
 
 # -- States --------------------------------------------------------------------------
@@ -377,20 +398,20 @@ def test_a_without_access_is_not_unplugged() -> None:
 
 
 def test_later_states() -> None:
-    stopping = decode_status(LATER, later(10))
+    stopping = decode_status(HEAD, later(10))
     assert stopping.raw_state == "C1"
-    assert state_of(LATER, "C1").charging is None
+    assert state_of(HEAD, "C1").charging is None
     waiting = replace(stopping, raw_state="B1", access=False)
-    assert is_stopped(LATER, waiting)
-    assert ocpp_status(LATER, waiting) is OcppStatus.SUSPENDED_EVSE
-    assert shows_plug(LATER, waiting)
+    assert is_stopped(HEAD, waiting)
+    assert ocpp_status(HEAD, waiting) is OcppStatus.SUSPENDED_EVSE
+    assert shows_plug(HEAD, waiting)
     assert stopping.serial == "4711"
     assert stopping.temperature == 20
 
 
 def test_an_impossible_temperature_is_none() -> None:
-    assert decode_status(LATER, later(kelvin=0)).temperature is None
-    assert decode_status(LATER, later(serial=0)).serial is None
+    assert decode_status(HEAD, later(kelvin=0)).temperature is None
+    assert decode_status(HEAD, later(serial=0)).serial is None
 
 
 def test_a_current_out_of_range_is_6_a() -> None:

@@ -19,7 +19,7 @@ from custom_components.evse_bus.evse.model import (
 from custom_components.evse_bus.evse.smartevse.dialects import MAPS, Dialect
 from tests.simulated_time import now
 
-from .polled_scene import ALL, LATER, OLDER, V2_17, V2_20, PolledScene, play
+from .polled_scene import ALL, HEAD, OLDER, V2_17, V2_20, PolledScene, play
 
 each = pytest.mark.parametrize("dialect", ALL)
 
@@ -47,10 +47,10 @@ def test_a_setting_is_that_of_the_same_name_in_the_box(
         for value in (span.minimum, span.maximum):
             await scene.charger.configure(setting, value)
             stored = scene.outlet.settings[NAMES[setting]]
-            if dialect is LATER and setting is Setting.SOLAR_START_CURRENT:
+            if dialect is HEAD and setting is Setting.SOLAR_START_CURRENT:
                 # In the box an import counts up from -16.
                 assert stored == 16 - value
-            elif dialect is LATER and setting is Setting.SOLAR_IMPORT_CURRENT:
+            elif dialect is HEAD and setting is Setting.SOLAR_IMPORT_CURRENT:
                 assert stored == 48 + value
             else:
                 assert stored == value
@@ -159,7 +159,7 @@ def test_settings_changed_at_the_box_are_read(dialect: Dialect) -> None:
         await asyncio.sleep(310)
         assert scene.reading.settings[Setting.MAXIMUM_CURRENT] == 12
         assert scene.charger.limits.ceiling == 12
-        block = MAPS[dialect].configuration[0].register
+        block = MAPS[dialect].configuration[1].register
         reads = [s for s in scene.line.sent if int.from_bytes(s.data[2:4]) == block]
         assert len(reads) == 2
 

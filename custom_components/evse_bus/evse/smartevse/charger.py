@@ -72,6 +72,7 @@ class SmartEvseCharger[C: SmartEvseConfig](SmartEvseReader[C]):
         ranges = {
             setting: Range(*word.kind.span)
             for setting, word in MAPS[self.dialect].settings.items()
+            if setting in self.configuration.settings
         }
         # No setting may allow the box more than its wiring carries.
         own = ranges[Setting.MAXIMUM_CURRENT]

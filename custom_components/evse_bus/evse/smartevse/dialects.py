@@ -1,13 +1,17 @@
-"""The three dialects of a SmartEVSE v2: the contents of their registers, as tables.
+"""The six dialects of a SmartEVSE: registers, states and habits, as tables.
 
-Source: README of v2 (registers 0x00A*, 0x00C*, 0x00E*), for the dialect 2.17
-corrected by the recorded replies of its firmware, and PROTOCOLS.md, 3. All registers
-are unsigned words; currents offered to the car are in 0.1 A, limits of a box or an
-installation in A.
+Source: README of v2 (registers 0x00A*, 0x00C*, 0x00E*), for 2.17 to HEAD corrected by
+the recorded replies of the firmwares, for 3.x its source as read, and PROTOCOLS.md, 3.
+All registers are unsigned words; currents offered to the car are in 0.1 A, limits of a
+box or an installation in A.
+
+A word that a firmware newer than these tables may use differently is ``None`` where its
+value is not known, and stays visible in the details. Only what distinguishes a status
+from other contents (the state of 2.17 and 2.20, a minimum, a setting) is required.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Final, override
 
@@ -21,12 +25,17 @@ UNITS: Final = range(9)
 
 
 class Dialect(StrEnum):
-    """The register layout of a firmware."""
+    """The register layout and the habits of a firmware."""
 
     V2_17 = "2.17"
     V2_20 = "2.20"
-    LATER = "later"
-    """Later 2.x, and 3.x."""
+    V2_30 = "2.30"
+    V2_HEAD = "2.30+"
+    """After 2.30, never released; its display says 2.30 as well."""
+    V3_OLD = "3.x-26"
+    """3.x with a block 0x0200 of 26 words; perhaps without a time-out of its own."""
+    V3 = "3.x"
+    """3.x with a block 0x0200 of 22 words."""
 
 
 # -- Contents ----------------------------------------------------------------------
@@ -43,6 +52,11 @@ FAULTS: Final[Mapping[int, Fault]] = {
     32: Fault.NO_SUN,
 }
 """By bit of the error register; 64 and 128 are its self-test and back light."""
+_FAULTS_3: Final = {
+    bit: fault for bit, fault in FAULTS.items() if fault is not Fault.NO_SUN
+}
+"""3.x: 32 is the test of the residual current monitor in newer ones, no sun in older
+ones; which one cannot be told."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,12 +64,14 @@ class Status:
     """Contents of a status block."""
 
     raw_state: str
-    """``A`` to ``D``, ``E`` to ``H`` waiting for a master, ``T``, ``B1``, ``C1``."""
+    """``A`` to ``D``, ``E`` to ``H`` waiting for a master, ``T``, ``B1``, ``C1``; the
+    number of a state that is not known."""
     error: int
     """Bits, see `FAULTS`."""
     current: float
     """In force while a car charges, A; ``A6`` / ``0002``."""
-    access: bool
+    access: bool | None
+    """``None``: a value that is not known."""
     mode: Mode | None = None
     maximum: int | None = None
     """Of cable or box, A; ``None``: no cable was measured yet."""
@@ -64,11 +80,6 @@ class Status:
     temperature: int | None = None
     """Degrees Celsius; ``None``: no sensor, or its value is not possible."""
     serial: str | None = None
-
-    @property
-    def faults(self) -> frozenset[Fault]:
-        """Return the error bits by name."""
-        return frozenset(fault for bit, fault in FAULTS.items() if self.error & bit)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,18 +95,59 @@ class _Digits(Numeric[str]):
         raise self.refused("cannot be written")
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _StateName(Numeric[str]):
+    """The number of a state; one without a name keeps its number."""
+
+    names: Mapping[int, str]
+
+    @override
+    def value(self, raw: int) -> str:
+        return self.names.get(raw, str(raw))
+
+    @override
+    def raw(self, value: object) -> int:
+        raise self.refused("cannot be written")
+
+
 _LETTERS: Final = "ABCDEFGH"
 _LETTER_STATES: Final = {ord(letter): letter for letter in f"{_LETTERS}T"}
 _NUMBER_STATES: Final = {**dict(enumerate(_LETTERS)), 8: "T"}
 _LATER_STATES: Final = {**_NUMBER_STATES, 9: "B1", 10: "C1"}
+MODEM_STATES: Final = range(11, 15)
+"""3.x with a modem (ISO 15118): requests, waits, done, denied."""
 
-_ERROR: Final = Number(possible=range(0x100))
+_ERROR: Final = Number()
 _CURRENT: Final = Scaled(unit="A", divisor=10)
-_MAXIMUM: Final = known(Number(unit="A", possible=range(161)), range(1, 0x10000))
-_MODE: Final = Choice(values=dict(enumerate(MODES)))
-_KELVIN: Final = known(Number(unit="degrees C", offset=273), range(273 - 60, 273 + 151))
+_MAXIMUM: Final = known(Number(unit="A"), range(1, 161))
+_MODE: Final = known(Choice(values=dict(enumerate(MODES))), range(len(MODES)))
+_ACCESS: Final = known(Flag(), range(2))
+_ACCESS_3: Final = known(Choice(values={0: False, 1: True, 2: False}), range(3))
+"""2: paused, which waits for a new 1 as 0 does."""
+_POSSIBLE: Final = range(-60, 151)
+"""Temperatures in degrees C."""
+_KELVIN: Final = known(
+    Number(unit="degrees C", offset=273),
+    range(273 + _POSSIBLE.start, 273 + _POSSIBLE.stop),
+)
 _SERIAL: Final = known(_Digits(), range(1, 0x10000))
 _BALANCING: Final = Number(possible=UNITS)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Celsius(Numeric[int | None]):
+    """A signed temperature; the first 3.x report it in K, from 213."""
+
+    @override
+    def value(self, raw: int) -> int | None:
+        if raw in _KELVIN.within:
+            return raw - 273
+        signed = raw - 0x10000 if raw >> 15 else raw
+        return signed if signed in _POSSIBLE else None
+
+    @override
+    def raw(self, value: object) -> int:
+        raise self.refused("cannot be written")
 
 
 def _status_a0(states: Mapping[int, str]) -> Registers[Status]:
@@ -110,8 +162,29 @@ def _status_a0(states: Mapping[int, str]) -> Registers[Status]:
             "maximum": Word(0xA2, _MAXIMUM),
             "minimum": Word(0xA3, _amperes(6, 16)),
             "current": Word(0xA6, _CURRENT),
-            "access": Word(0xA7, Flag()),
+            "access": Word(0xA7, _ACCESS),
             "mode": Word(0xA8, _MODE),
+        },
+    )
+
+
+def _status_0000(
+    temperature: Numeric[int | None], access: Numeric[bool | None]
+) -> Registers[Status]:
+    """Return the status block of 2.30 and later."""
+    return Registers(
+        Status,
+        "README of later versions, 0x0000",
+        _read(0x0000, 12),
+        {
+            "raw_state": Word(0x0000, _StateName(names=_LATER_STATES)),
+            "error": Word(0x0001, _ERROR),
+            "current": Word(0x0002, _CURRENT),
+            "mode": Word(0x0003, _MODE),
+            "access": Word(0x0005, access),
+            "maximum": Word(0x0007, _MAXIMUM),
+            "temperature": Word(0x000A, temperature),
+            "serial": Word(0x000B, _SERIAL),
         },
     )
 
@@ -140,6 +213,24 @@ class Map:
     """Read once per connect and then rarely."""
     settings: Mapping[Setting, Word[Number]]
     """In the EEPROM of the box."""
+    faults: Mapping[int, Fault] = field(default_factory=lambda: FAULTS)
+    """By bit of the error register."""
+    standard_exceptions: bool = False
+    """Its exceptions have 0x80 in the function."""
+    needs_quiet: bool = False
+    """A request on the line, to any address, suspends its own cycle."""
+    search_time: float = 0.0
+    """Without a master, it ignores its limit for this long from the first charge of
+    each car, s: it searches for the smallest current."""
+    search_current: float = 0.0
+    """The highest current of this search, A."""
+    reports_maximum: bool = False
+    """Its status has the smaller of cable and MAX, not that of the cable alone."""
+    begins_at_0: bool = False
+    """Without a master, a charge begins at the maximum while the current reads 0."""
+    shows_plug: bool = False
+    """A plugged car without access is B1, and one that an error has stopped too; the
+    others report A for both."""
 
     @property
     def current_register(self) -> int:
@@ -166,6 +257,49 @@ PROBE_A0: Final = _read(0xA0, 9)
 """Status of 2.17 and 2.20; the type of the state, letter or number, differs."""
 PROBE_A9: Final = Block(0xA9, 3, READ_HOLDING_REGISTERS)
 """Only 2.20 has these, and only from 2.20 on is 0x03 answered."""
+
+PROBE_HEAD: Final = _read(0x021A, 1)
+"""Refused by 2.30, answered by what came after it."""
+PROBE_V3_OLD: Final = _read(0x0216, 1)
+"""Refused by 3.x with a block 0x0200 of 22 words, answered by those with 26."""
+
+
+def _later(status: Registers[Status], *, start: Number, imported: Number) -> Map:
+    """Return the row of a dialect whose status is at 0x0000.
+
+    ``start``, ``imported``: the words of START and IMPORT.
+    """
+    return Map(
+        status=status,
+        socket=Word(0x0100, Flag()),
+        load_balancing=Word(0x0104, _BALANCING),
+        configuration=(_read(0x0100, 5), _read(0x0200, 8)),
+        settings={
+            Setting.MINIMUM_CURRENT: Word(0x0102, _amperes(6, 16)),
+            Setting.MAXIMUM_CURRENT: Word(0x0103, _amperes(6, 80)),
+            Setting.CIRCUIT_CURRENT: Word(0x0201, _amperes(10, 160)),
+            Setting.MAINS_CURRENT: Word(0x0204, _amperes(10, 200)),
+            Setting.MODE_AT_START: Word(0x0200, Number(possible=range(3))),
+            Setting.SOLAR_START_CURRENT: Word(0x0205, start),
+            Setting.SOLAR_STOP_TIME: Word(0x0206, _minutes(0, 60)),
+            Setting.SOLAR_IMPORT_CURRENT: Word(0x0207, imported),
+        },
+        needs_quiet=True,
+    )
+
+
+_VERSION_3: Final = replace(
+    _later(
+        _status_0000(_Celsius(unit="degrees C"), _ACCESS_3),
+        start=_amperes(0, 48),
+        imported=_amperes(0, 48),
+    ),
+    # As a node it has no cycle of its own, but one that is polled may need the quiet.
+    # With an ESP32 it answers as a node only.
+    faults=_FAULTS_3,
+    standard_exceptions=True,
+    shows_plug=True,
+)
 
 MAPS: Final[Mapping[Dialect, Map]] = {
     # Confirmed by the defaults in the replies of its firmware; the README's own tables
@@ -197,39 +331,27 @@ MAPS: Final[Mapping[Dialect, Map]] = {
             Setting.SOLAR_IMPORT_CURRENT: Word(0xC9, _amperes(0, 6)),
         },
     ),
-    Dialect.LATER: Map(
-        status=Registers(
-            Status,
-            "README of later versions, 0x0000",
-            _read(0x0000, 12),
-            {
-                "raw_state": Word(0x0000, Choice(values=_LATER_STATES)),
-                "error": Word(0x0001, _ERROR),
-                "current": Word(0x0002, _CURRENT),
-                "mode": Word(0x0003, _MODE),
-                "access": Word(0x0005, Flag()),
-                "maximum": Word(0x0007, _MAXIMUM),
-                "temperature": Word(0x000A, _KELVIN),
-                "serial": Word(0x000B, _SERIAL),
-            },
-        ),
-        socket=Word(0x0100, Flag()),
-        load_balancing=Word(0x0104, _BALANCING),
-        configuration=(_read(0x0100, 5), _read(0x0200, 8)),
-        settings={
-            Setting.MINIMUM_CURRENT: Word(0x0102, _amperes(6, 16)),
-            Setting.MAXIMUM_CURRENT: Word(0x0103, _amperes(6, 80)),
-            Setting.CIRCUIT_CURRENT: Word(0x0201, _amperes(10, 160)),
-            Setting.MAINS_CURRENT: Word(0x0204, _amperes(10, 200)),
-            Setting.MODE_AT_START: Word(0x0200, Number(possible=range(3))),
-            # The word less 16 is an import; ours is an export, as in 2.20.
-            Setting.SOLAR_START_CURRENT: Word(
-                0x0205, Number(unit="A", possible=range(33), offset=16, sign=-1)
-            ),
-            Setting.SOLAR_STOP_TIME: Word(0x0206, _minutes(0, 60)),
-            Setting.SOLAR_IMPORT_CURRENT: Word(
-                0x0207, Number(unit="A", possible=range(97), offset=48)
-            ),
-        },
+    Dialect.V2_30: _later(
+        _status_0000(_KELVIN, _ACCESS),
+        start=_amperes(1, 16),
+        imported=_amperes(0, 6),
     ),
+    Dialect.V2_HEAD: replace(
+        _later(
+            _status_0000(_KELVIN, _ACCESS),
+            # The word less 16 is an import; ours is an export, as in 2.20.
+            start=Number(unit="A", possible=range(33), offset=16, sign=-1),
+            imported=Number(unit="A", possible=range(97), offset=48),
+        ),
+        reports_maximum=True,
+        search_time=90.0,
+        search_current=8.0,
+        begins_at_0=True,
+        shows_plug=True,
+    ),
+    Dialect.V3_OLD: _VERSION_3,
+    Dialect.V3: _VERSION_3,
 }
+VERSION_3: Final = frozenset({Dialect.V3_OLD, Dialect.V3})
+LATER: Final = frozenset(Dialect) - {Dialect.V2_17, Dialect.V2_20}
+"""The dialects whose status is at 0x0000."""

@@ -49,12 +49,19 @@ from ..safety import Setpoint, clamp
 from ..schedule import Kind
 from .charger import SmartEvseCharger
 from .config import PolledConfig
-from .dialects import MAPS, Dialect, Status
+from .dialects import MAPS, Status
 from .memory import SmartEvseMemory
 from .mode import mode_conversation
 from .reader import READ_AGAIN, TIMING, WRITES
 from .registers import tenths, write_current
-from .states import CHARGING, is_stopped, offered, shows_plug, state_of
+from .states import (
+    CHARGING,
+    UNPLUGGED,
+    is_stopped,
+    offered,
+    shows_plug,
+    state_of,
+)
 
 QUIET: Final = 6.5
 """Time without any request on the line that a later box needs, s."""
@@ -94,6 +101,10 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
         """The status was read since, when the override had had time to take effect."""
         self._confirmed: int | None = None
         """The set-point within which it was read back to charge, 0.1 A."""
+        self._charging_since: float | None = None
+        """Loop time at which the car was first seen to charge."""
+        self._searches = False
+        """It may be searching for the car's smallest current, whatever its limit."""
         self._fell_back = False
         """It offers more than it had already confirmed."""
         self._paused_for_limit = False
@@ -107,8 +118,8 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
     @property
     @override
     def exchanges_per_turn(self) -> int:
-        # Dialect (2), status, settings (2), access and current, both read back.
-        return 10
+        # Dialect (4), status, settings (2), access and current, both read back.
+        return 12
 
     @override
     def minimum_pause(self, now: float) -> float:
@@ -126,7 +137,7 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
         """Return whether it needs quiet; before it is known, as the last box here."""
         memory = self._line_memory.of(SmartEvseMemory)
         if self.dialect is not None:
-            memory.needs_quiet = self.dialect is Dialect.LATER
+            memory.needs_quiet = MAPS[self.dialect].needs_quiet
         return memory.needs_quiet
 
     @override
@@ -217,18 +228,36 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
             self._written = None
         super().on_status(status, now)
         charging = status.raw_state in CHARGING
+        self._follow_car(status, now)
         within = charging and not self._is_above(status)
         setpoint = tenths(self.setpoint)
         if charging and not within:
             self._fell_back = self._confirmed == setpoint
         self._confirmed = setpoint if within else None
-        if status.access and not self.setpoint.paused:
+        if status.access is True and not self.setpoint.paused:
             # Access was opened at the box: nothing is left to restore.
             self._paused_for_limit = False
             self._excess = None
         settled = self._excess is None and not self._must_stop()
         if settled and (within or not charging):
             self.notice(Fault.LIMIT_NOT_TAKEN, present=False)
+
+    def _follow_car(self, status: Status, now: float) -> None:
+        """Take note of when the car began to charge, and of its leaving."""
+        dialect = self.known_dialect
+        if status.raw_state in CHARGING:
+            if self._charging_since is None:
+                self._charging_since = now
+        elif status.raw_state == UNPLUGGED and shows_plug(dialect, status):
+            self._charging_since = None
+        row, since = MAPS[dialect], self._charging_since
+        current = offered(dialect, status)
+        self._searches = (
+            since is not None
+            and now < since + row.search_time
+            and current is not None
+            and current <= row.search_current
+        )
 
     def _is_above(self, status: Status, setpoint: Setpoint | None = None) -> bool:
         """Return whether more than the set-point is offered; False without a car."""
@@ -304,12 +333,12 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
 
     async def _stop(self, turn: Turn, *, ours: bool) -> None:
         """Turn access off; ``ours``: for lack of current, so that it is restored."""
-        had_access = self.status is None or self.status.access
+        had_access = self.status is None or self.status.access is not False
         try:
             await self.set_access(turn, allowed=False)
         except NotConfirmedError:
             # Where access is off, the car alone is the problem (`watch_pause`).
-            taken = self.status is not None and not self.status.access
+            taken = self.status is not None and self.status.access is False
             self.notice(Fault.LIMIT_NOT_TAKEN, present=not taken)
             raise
         self._paused_for_limit = ours and (had_access or self._paused_for_limit)
@@ -332,6 +361,8 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
         """
         if self._written != tenths(target):
             return False
+        if self._searches:
+            return True
         charging = status.raw_state in CHARGING
         return not (charging and self._read_back and self._is_above(status, target))
 
@@ -455,9 +486,10 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
 
         A poll or another conversation may come first: one reading is for all.
         """
-        if self.known_dialect is not Dialect.LATER and not self._read_back:
+        needs_quiet = MAPS[self.known_dialect].needs_quiet
+        if not needs_quiet and not self._read_back:
             await rest(READ_AGAIN)
-        while not self._read_back:
+        while not self._read_back or self._searches_above(wanted()):
             if (pause := self._rest_of_quiet(turn.now)) > 0:
                 await rest(pause)
                 continue
@@ -465,11 +497,18 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
             status = self.status
             if status is None or status.raw_state not in CHARGING:
                 return
-            if self.known_dialect is Dialect.LATER:
+            if needs_quiet:
                 continue
             if offered(self.known_dialect, status) == wanted().current:
                 return
             await rest(READ_AGAIN)
+
+    def _searches_above(self, setpoint: Setpoint) -> bool:
+        """Return whether more is offered only in search of a smallest current."""
+        status = self.status
+        return (
+            self._searches and status is not None and self._is_above(status, setpoint)
+        )
 
     # -- Orders --------------------------------------------------------------------
 
@@ -534,7 +573,8 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
         """
         if change.allowed is True:
             return True
-        if not self._paused_for_limit or self.status is None or self.status.access:
+        status = self.status
+        if not self._paused_for_limit or status is None or status.access is not False:
             return False
         wanted = self._wanted(change)
         return not wanted.paused and wanted.current >= (self._excess or 0.0)

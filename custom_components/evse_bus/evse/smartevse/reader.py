@@ -33,7 +33,7 @@ from ..model import (
 from ..pause_watch import FOLLOW_TIME
 from ..registers import Block
 from .config import SmartEvseConfig
-from .dialects import MAPS, PROBE_A0, Dialect, Status
+from .dialects import LATER, MAPS, PROBE_A0, Dialect, Status
 from .probing import find_dialect
 from .readings import capabilities_of, charger_info, charger_reading
 from .registers import (
@@ -73,10 +73,11 @@ CONFIGURATION_INTERVAL: Final = 300.0
 """Time between two readings of a box's settings, s."""
 CONFIGURATION_RETRY: Final = 30.0
 """Pause after settings that could not be read, s."""
-HIDDEN_BY_ACCESS: Final = 5.0
-"""After access was off, ``A`` may still mean a plugged car for this long, s."""
 HIDDEN_BY_ERROR: Final = 65.0
-"""After an error likewise: a box waits for 60 s before it resumes, s."""
+"""After an error, ``A`` may mean a plugged car for this long, s: a box waits for 60 s
+before it resumes."""
+HIDDEN_BY_START: Final = 10.0
+"""After its power-up likewise, s; 7 s were recorded."""
 
 
 class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
@@ -196,7 +197,7 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
 
     def _check_identity(self, status: Status) -> None:
         """Raise WrongChargerError where another serial number is reported."""
-        if self.dialect is not Dialect.LATER:
+        if self.dialect is None or self.dialect not in LATER:
             return
         expected = self.config.serial or self._serial
         if expected is not None and status.serial != expected:
@@ -286,11 +287,7 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
     def on_status(self, status: Status, now: float) -> None:
         """Accept a status, and make a reading of it."""
         dialect = self.known_dialect
-        if not shows_plug(dialect, status):
-            hidden = HIDDEN_BY_ERROR if status.faults else HIDDEN_BY_ACCESS
-            self._plug_hidden_until = max(self._plug_hidden_until, now + hidden)
-        elif status.raw_state != UNPLUGGED:
-            self._plug_hidden_until = 0.0
+        self._hide_plug(dialect, status, now)
         self.status = status
         reading = charger_reading(
             dialect,
@@ -304,9 +301,23 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
             self.updated()
         self.watch_pause(
             now,
-            shown=not status.access,
+            shown=status.access is False,
             patience=FOLLOW_TIME if status.raw_state in CHARGING else None,
         )
+
+    def _hide_plug(self, dialect: Dialect, status: Status, now: float) -> None:
+        """Take note of how long ``A`` does not mean that there is no car."""
+        before = self.status
+        hidden = 0.0
+        if not shows_plug(dialect, status):
+            # A car that keeps its request stays in A when access is on again.
+            hidden = HIDDEN_BY_ERROR if status.access else inf
+        elif status.raw_state != UNPLUGGED:
+            self._plug_hidden_until = 0.0
+        elif status.maximum is None and (before is None or before.maximum is not None):
+            # No cable was measured since it was switched on, perhaps just now.
+            hidden = HIDDEN_BY_START
+        self._plug_hidden_until = max(self._plug_hidden_until, now + hidden)
 
     # -- Configuration -------------------------------------------------------------
 
@@ -371,7 +382,7 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
     async def close_access(self, turn: Turn) -> None:
         """Turn access off where a setting has opened it; raises as `set_access`."""
         await self.read_status(turn)
-        if self.status is None or self.status.access:
+        if self.status is None or self.status.access is not False:
             await rest()
             await self.set_access(turn, allowed=False)
         self.must_close_access = False
@@ -381,5 +392,5 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
         if self.status is None:
             return False
         if allowed:
-            return self.status.access
+            return self.status.access is True
         return is_stopped(self.known_dialect, self.status)

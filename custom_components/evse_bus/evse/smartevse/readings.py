@@ -4,9 +4,17 @@ from typing import Final
 
 from ..model import Capability, Setting, Status as OcppStatus
 from ..readings import ChargerInfo, ChargerReading, ConnectorReading
-from .dialects import MAPS, Dialect, Status
+from .dialects import MAPS, VERSION_3, Dialect, Status
 from .registers import Configuration
-from .states import UNPLUGGED, ocpp_status, offered, shows_plug, state_of
+from .states import (
+    UNKNOWN,
+    UNPLUGGED,
+    faults_of,
+    ocpp_status,
+    offered,
+    shows_plug,
+    state_of,
+)
 
 _CAPABILITIES: Final = frozenset(
     {
@@ -24,7 +32,10 @@ _CAPABILITIES: Final = frozenset(
 _FIRMWARE: Final = {
     Dialect.V2_17: "2.17",
     Dialect.V2_20: "2.20",
-    Dialect.LATER: "later than 2.20",
+    Dialect.V2_30: "2.30",
+    Dialect.V2_HEAD: "2.30, development version",
+    Dialect.V3_OLD: "3.x, up to 3.7 or so",
+    Dialect.V3: "3.x",
 }
 
 
@@ -39,7 +50,7 @@ def charger_info(dialect: Dialect, serial: str | None) -> ChargerInfo:
     """Return the identity of a box; its firmware is inferred from its dialect."""
     return ChargerInfo(
         manufacturer="Stegen Electronics",
-        model="SmartEVSE v2",
+        model="SmartEVSE v3" if dialect in VERSION_3 else "SmartEVSE v2",
         serial=serial,
         firmware=_FIRMWARE[dialect],
     )
@@ -63,7 +74,10 @@ def charger_reading(
         plug_known and shows_plug(dialect, status)
     )
     settings = configuration.settings if configuration is not None else {}
-    maxima = (status.maximum, settings.get(Setting.MAXIMUM_CURRENT))
+    maxima = [status.maximum, settings.get(Setting.MAXIMUM_CURRENT)]
+    if configuration is None and not MAPS[dialect].reports_maximum:
+        # The cable's alone is not the maximum.
+        maxima = []
     minimum = status.minimum or settings.get(Setting.MINIMUM_CURRENT)
     ocpp = ocpp_status(dialect, status)
     if ocpp is OcppStatus.OUT_OF_SERVICE and waits:
@@ -78,14 +92,14 @@ def charger_reading(
     return ChargerReading(
         connectors={1: connector},
         allowed=status.access,
-        offered_current=offered(dialect, status),
+        offered_current=None if state is UNKNOWN else offered(dialect, status),
         maximum_current=min(
             (float(one) for one in maxima if one is not None), default=None
         ),
         mode=status.mode,
         temperature=(None if status.temperature is None else float(status.temperature)),
         settings=settings,
-        faults=status.faults,
+        faults=faults_of(dialect, status),
         fault_codes=(f"0x{status.error:02X}",) if status.error else (),
         details={
             "dialect": dialect.value,

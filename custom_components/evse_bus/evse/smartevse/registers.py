@@ -39,6 +39,12 @@ ILLEGAL_VALUE: Final = 3
 
 # -- Reading -----------------------------------------------------------------------
 
+_REQUIRED: Final = (Setting.MINIMUM_CURRENT, Setting.MAXIMUM_CURRENT)
+
+
+class MalformedRefusalError(ExchangeRefusedError):
+    """An exception without the 0x80 in its function, as 2.x sends it."""
+
 
 def decode_status(dialect: Dialect, data: bytes) -> Status:
     """Return the contents of a status block of this dialect.
@@ -66,17 +72,21 @@ def decode_configuration(
 ) -> Configuration:
     """Return the contents of all blocks of a dialect's configuration.
 
-    Raises ImplausibleReplyError if any value is missing or impossible.
+    A setting with an unknown value is left out, if no limit depends on it. Raises
+    ImplausibleReplyError if a word is missing or a required value is impossible.
     """
     layout = MAPS[dialect]
     words: dict[int, int] = {}
     for block, data in blocks.items():
         words |= words_of(block, data)
+    settings: dict[Setting, int] = {}
     try:
-        settings = {
-            setting: _decode(words, word, setting)
-            for setting, word in layout.settings.items()
-        }
+        for setting, word in layout.settings.items():
+            try:
+                settings[setting] = _decode(words, word, setting)
+            except ImplausibleReplyError:
+                if setting in _REQUIRED:
+                    raise
         # In 2.17 a status that arrives late is as long, and looks like settings.
         _decode(words, layout.socket, "socket or fixed cable")
         load_balancing = _decode(words, layout.load_balancing, "load balancing")
@@ -84,6 +94,21 @@ def decode_configuration(
         message = f"register {error} was not read"
         raise ImplausibleReplyError(message) from error
     return Configuration(settings=settings, load_balancing=load_balancing)
+
+
+def has_known_box(dialect: Dialect, words: Mapping[int, int]) -> bool:
+    """Return whether words of the configuration are those of a SmartEVSE.
+
+    ``words``: its first block, by register.
+    """
+    row = MAPS[dialect]
+    kinds = (row.socket, row.load_balancing, *(row.settings[one] for one in _REQUIRED))
+    try:
+        for word in kinds:
+            _decode(words, word, "a setting")
+    except ImplausibleReplyError, KeyError:
+        return False
+    return True
 
 
 def _decode[V](words: Mapping[int, int], word: Word[Numeric[V]], name: str) -> V:
@@ -116,6 +141,8 @@ def read_answer(unit: int, block: Block) -> Callable[[ModbusFrame], bytes | None
             return None
         if (code := refusal_code(frame, block.function)) is not None:
             message = f"the box refused to read {block.register:#06x}: exception {code}"
+            if frame.function == block.function:
+                raise MalformedRefusalError(message, code)
             raise ExchangeRefusedError(message, code)
         return registers_read(frame, block.words, block.function)
 

@@ -37,9 +37,9 @@ from .registers import (
 )
 
 POLLED_UNITS: Final = (1, 0)
-"""The addresses of a box without load balancing and of one that is its own master, the
-more common one first. At 0 only 2.17 (and some of 2.20) replies, alone on its bus.
-Slaves stop without a master's broadcast, so there is nothing to poll."""
+"""The addresses of a box without load balancing: 1 from 2.30 on, else 0, alone on its
+bus; a box that is its own master has 1. Slaves stop without a master's broadcast, so
+there is nothing to poll."""
 POLL_FIRST: Final = 0.1
 """Pause between the end of the quiet of a running box and the first request, s."""
 ATTEMPTS: Final = 2
@@ -145,7 +145,7 @@ async def _search(bus: Bus, unit: int) -> tuple[FoundCharger | None, bool]:
             return None, False
         else:
             memory = bus.line.memory.of(SmartEvseMemory)
-            memory.needs_quiet |= dialect is Dialect.LATER
+            memory.needs_quiet |= MAPS[dialect].needs_quiet
             return charger, False
     return None, garbled >= ATTEMPTS
 

@@ -55,7 +55,7 @@ async def _set(
             return
         # Kept until access is certain: replies may be lost, or the line.
         reader.must_close_access |= (
-            reader.status is not None and not reader.status.access
+            reader.status is not None and reader.status.access is False
         )
         dialect = reader.known_dialect
         # Once, whatever the reply: the read-back shows whether it took effect.
@@ -77,7 +77,7 @@ def _is_set(
     reader: SmartEvseReader[SmartEvseConfig], setting: Setting, value: int
 ) -> bool:
     configuration = reader.configuration
-    return configuration is not None and configuration.settings[setting] == value
+    return configuration is not None and configuration.settings.get(setting) == value
 
 
 async def _close_access(reader: SmartEvseReader[SmartEvseConfig], turn: Turn) -> None:

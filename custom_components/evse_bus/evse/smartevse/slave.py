@@ -354,7 +354,7 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
                 with suppress(EvseError):
                     await self.read_status_once(turn)
                 await rest()
-            had_access = self.status is None or self.status.access
+            had_access = self.status is None or self.status.access is not False
             self._paused_by_us = own and (had_access or self._paused_by_us)
         still_wanted = self._may_be_on if allowed else self._must_be_off
         await self.set_access(turn, allowed, still_wanted)
@@ -372,7 +372,7 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
     @property
     def _has_no_access(self) -> bool:
         """Return whether its access was off in the last status."""
-        return self.status is not None and not self.status.access
+        return self.status is not None and self.status.access is False
 
     # -- Orders --------------------------------------------------------------------
 

@@ -1,7 +1,7 @@
-"""The states of a SmartEVSE v2 and their meaning. Pure.
+"""The states of a SmartEVSE and their meaning. Pure.
 
 Source: README of v2, register 0x00A0 (A to H, T), README of later versions, register
-0x0000 (B1, C1), and PROTOCOLS.md, 3. With access off, 2.17 and 2.20 report ``A`` also
+0x0000 (B1, C1), and PROTOCOLS.md, 3. With access off, 2.17 to 2.30 report ``A`` also
 for a plugged car; later ones report B1, or C1 for the seconds until the car has ended.
 """
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from ..model import MAXIMUM_CURRENT, MINIMUM_CURRENT, Fault, Status as OcppStatus
-from .dialects import Dialect, Status
+from .dialects import MAPS, Dialect, Status
 
 UNPLUGGED: Final = "A"
 CHARGING: Final = frozenset({"C", "D"})
@@ -27,12 +27,15 @@ _STOPPED_BY: Final = frozenset({Fault.NO_COMM, Fault.TEMP_HIGH, Fault.RCD})
 class State:
     """The meaning of a state by itself; ``None``: unknown."""
 
-    status: OcppStatus
+    status: OcppStatus | None
     plugged: bool | None
     charging: bool | None = False
     offers: bool | None = False
-    """The pilot offers a current; ``None``: there is no car to offer it to."""
+    """The pilot offers a current, or may; ``None``: there is no car to offer it to."""
 
+
+UNKNOWN: Final = State(status=None, plugged=None, charging=None, offers=True)
+"""A state without a name: a modem's in 3.x, or one of newer firmware."""
 
 _PREPARING: Final = State(status=OcppStatus.PREPARING, plugged=True)
 _COMMON: Final[Mapping[str, State]] = {
@@ -65,56 +68,67 @@ _NUMBERED: Final[Mapping[str, State]] = {
 
 
 def state_of(dialect: Dialect, raw_state: str) -> State:
-    """Return the meaning of a state; each that `decode_status` returns has one."""
+    """Return the meaning of a state, which may be `UNKNOWN`."""
     table = _V2_17 if dialect is Dialect.V2_17 else _NUMBERED
-    return table[raw_state]
+    return table.get(raw_state, UNKNOWN)
+
+
+def faults_of(dialect: Dialect, status: Status) -> frozenset[Fault]:
+    """Return the error bits by name."""
+    names = MAPS[dialect].faults
+    return frozenset(fault for bit, fault in names.items() if status.error & bit)
 
 
 def shows_plug(dialect: Dialect, status: Status) -> bool:
     """Return whether the state shows if a car is plugged in.
 
-    Later boxes report a plugged car without access (B1); the others report ``A`` for
-    it, and also while an error has stopped it.
+    Without access, and while an error has stopped the car, some dialects report ``A``
+    for it (`Map.shows_plug`).
     """
-    if status.raw_state != UNPLUGGED or dialect is Dialect.LATER:
+    if status.raw_state != UNPLUGGED or MAPS[dialect].shows_plug:
         return True
-    return status.access and not status.faults
+    return status.access is True and not faults_of(dialect, status)
 
 
 def is_stopped(dialect: Dialect, status: Status) -> bool:
     """Return whether access is off and the box has obeyed it."""
-    if status.access:
+    if status.access is not False:
         return False
-    # A later one that wakes a car up (T) goes on to B, and from there to C.
-    return status.raw_state in (_CLOSED if dialect is Dialect.LATER else (UNPLUGGED,))
+    # One that wakes a car up (T) goes on to B, and from there to C.
+    closed = _CLOSED if MAPS[dialect].shows_plug else (UNPLUGGED,)
+    return status.raw_state in closed
 
 
 def offered(dialect: Dialect, status: Status) -> float | None:
-    """Return the current that the pilot offers, A; ``None``: there is no car.
+    """Return the current that the pilot offers, or may, A; ``None``: there is no car.
 
-    A box whose current is out of range offers 6 A (PROTOCOLS.md, 3).
+    A box whose current is out of range offers 6 A; but one that begins a charge at its
+    maximum may report 0 then (`Map.begins_at_0`; PROTOCOLS.md, 3).
     """
     offers = state_of(dialect, status.raw_state).offers
     if offers is None:
-        return None if status.access else 0.0
+        return 0.0 if status.access is False else None
     if not offers:
         return 0.0
     if MINIMUM_CURRENT <= status.current <= MAXIMUM_CURRENT:
         return status.current
+    if MAPS[dialect].begins_at_0 and status.current == 0 and status.maximum is not None:
+        return float(max(status.maximum, MINIMUM_CURRENT))
     return MINIMUM_CURRENT
 
 
-def ocpp_status(dialect: Dialect, status: Status) -> OcppStatus:
-    """Return the state as a status of OCPP.
+def ocpp_status(dialect: Dialect, status: Status) -> OcppStatus | None:
+    """Return the state as a status of OCPP; ``None``: it has no known meaning.
 
     ``A`` without access is out of service: a car may be plugged in or not. An error
     that stops the box is a fault; a lack of current or sun is a pause.
     """
-    if status.faults & _STOPPED_BY:
+    faults = faults_of(dialect, status)
+    if faults & _STOPPED_BY:
         return OcppStatus.FAULTED
     if status.raw_state == UNPLUGGED:
-        if not status.access:
+        if status.access is False:
             return OcppStatus.OUT_OF_SERVICE
-        if status.faults:
+        if faults:
             return OcppStatus.SUSPENDED_EVSE
     return state_of(dialect, status.raw_state).status
