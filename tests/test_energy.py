@@ -2,6 +2,8 @@
 
 from collections.abc import Callable
 from datetime import timedelta
+import json
+from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
@@ -13,13 +15,13 @@ from homeassistant.core import (
     State,
     callback,
 )
-from homeassistant.helpers import issue_registry as ir
+from homeassistant.helpers import entity_registry as er, issue_registry as ir
 from homeassistant.util import dt as dt_util
 from hypothesis import given, strategies as st
 import pytest
 from pytest_homeassistant_custom_component.common import async_fire_time_changed
 
-from custom_components.evse_bus import energy as energy_module
+from custom_components.evse_bus import energy as energy_module, sensor as sensor_module
 from custom_components.evse_bus.const import DOMAIN
 from custom_components.evse_bus.energy import (
     INTERVAL,
@@ -35,11 +37,14 @@ from custom_components.evse_bus.energy import (
 from custom_components.evse_bus.evse.meter import most_energy
 from custom_components.evse_bus.stores.file import StoredFile
 from tests.common import crash, get_entity, running, shut_down, wait_for_state
+from tests.ews import polled
 from tests.virtual import AblBox, Car, EvboxChargePoint, Module
+from tests.virtual.ews_box import EwsBox
 
 meters = st.floats(0, 1e9)
 NOW = Clocks(monotonic=50.0, wall=1_000_000.0)
 DAY = 86_400.0
+TRANSLATIONS = Path(energy_module.__file__).parent / "translations"
 
 
 def later(seconds: float, *, corrected: float = 0.0) -> Clocks:
@@ -212,12 +217,125 @@ async def test_a_meter_after_a_restart(
         box.modules[0].energy_wh += grown
         await hass.config_entries.async_setup(entry.entry_id)
         await wait_for_state(hass, energy, str(shown))
-        issues = [
-            issue
-            for (domain, _), issue in ir.async_get(hass).issues.items()
-            if domain == DOMAIN and issue.translation_key == "energy_not_counted"
-        ]
-        assert len(issues) == count
+        assert len(not_counted(hass)) == count
+        for text in not_counted(hass):
+            assert f"changed by {grown / 1000:+g} kWh" in text
+            assert "the meter of Charger 1923054" in text
+
+
+def not_counted(hass: HomeAssistant) -> list[str]:
+    """Return the texts of the issues about energy, as a user reads them."""
+    key = "energy_not_counted"
+    texts = json.loads((TRANSLATIONS / "en.json").read_text())["issues"][key]
+    return [
+        texts["description"].format(**(issue.translation_placeholders or {}))
+        for (domain, _), issue in ir.async_get(hass).issues.items()
+        if domain == DOMAIN and issue.translation_key == key
+    ]
+
+
+class Wall:
+    """The wall clock of the computer, and how wrong it is."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.wrong_by = 0.0
+        monkeypatch.setattr(sensor_module, "_clocks", self._clocks)
+
+    def _clocks(self, hass: HomeAssistant) -> Clocks:
+        wall = dt_util.utcnow().timestamp() + self.wrong_by
+        return Clocks(hass.loop.time(), wall)
+
+
+@pytest.mark.parametrize("make", [EvboxChargePoint, EwsBox])
+async def test_a_computer_that_starts_with_yesterdays_time(
+    hass: HomeAssistant,
+    hass_storage: dict[str, Any],
+    monkeypatch: pytest.MonkeyPatch,
+    make: type[EvboxChargePoint | EwsBox],
+) -> None:
+    """22 kWh are charged in 4 h without Home Assistant, and counted in the end."""
+    wall = Wall(monkeypatch)
+    box = EvboxChargePoint(min_interval=0) if make is EvboxChargePoint else EwsBox()
+    set_meter(box, 6000.0)
+    async with running(hass, box, poll_interval=0.2) as (entry, _):
+        energy = await get_entity(hass, "sensor", entry, "1_energy")
+        await wait_for_state(hass, energy, "6.0")
+        await shut_down(hass, entry)
+        for record in hass_storage[TOTALS_KEY]["data"].values():
+            record["wall"] -= 4 * 3600
+        wall.wrong_by = -DAY
+        set_meter(box, 28_000.0)
+        await hass.config_entries.async_setup(entry.entry_id)
+        await wait_for_state(hass, energy, "6.0")
+        # Consumption of now counts meanwhile.
+        set_meter(box, 28_050.0)
+        await wait_for_state(hass, energy, "6.05")
+        wall.wrong_by = 0.0
+        set_meter(box, 28_060.0)
+        await wait_for_state(hass, energy, "28.06")
+        assert not_counted(hass) == []
+
+
+async def test_a_meter_that_is_not_itself_after_a_restart(
+    hass: HomeAssistant, hass_storage: dict[str, Any]
+) -> None:
+    """It reads 0 at first: what was charged in the absence counts all the same."""
+    box = EvboxChargePoint(1923054, [Module(energy_wh=6000)], min_interval=0)
+    async with running(hass, box, poll_interval=0.2) as (entry, _):
+        energy = await get_entity(hass, "sensor", entry, "1_energy")
+        await wait_for_state(hass, energy, "6.0")
+        await shut_down(hass, entry)
+        for record in hass_storage[TOTALS_KEY]["data"].values():
+            record["wall"] -= 3600
+        set_meter(box, 0.0)
+        await hass.config_entries.async_setup(entry.entry_id)
+        await wait_for_state(hass, energy, "6.0")
+        set_meter(box, 8000.0)
+        await wait_for_state(hass, energy, "8.0")
+        assert not_counted(hass) == []
+
+
+@pytest.mark.parametrize("total", [0.0, 12.05, 5000.0])
+async def test_a_meter_that_is_set_adds_nothing(
+    hass: HomeAssistant, hass_storage: dict[str, Any], total: float
+) -> None:
+    """Not now, and not after a crash right behind it."""
+    box = EwsBox()
+    set_meter(box, 12_000.0)
+    async with running(hass, box) as (entry, bus):
+        energy = await get_entity(hass, "sensor", entry, "1_energy")
+        await wait_for_state(hass, energy, "12.0")
+        shown: set[str] = set()
+        hass.bus.async_listen(
+            "state_changed",
+            lambda event: shown.add(event.data["new_state"].state),
+            only(energy),
+        )
+        device = er.async_get(hass).async_get(energy)
+        assert device is not None
+        data = {"device_id": device.device_id, "total": total}
+        await hass.services.async_call(DOMAIN, "set_meter_total", data, blocking=True)
+        meter = box.ports[0].session
+        assert meter.total_wh == total * 1000
+        await polled(bus, box)
+        meter.total_wh += 30
+        await wait_for_state(hass, energy, "12.03")
+        await hass.async_block_till_done(wait_background_tasks=True)
+        await crash(hass, entry, hass_storage)
+        await hass.config_entries.async_setup(entry.entry_id)
+        await wait_for_state(hass, energy, lambda state: is_above(state, 11))
+        meter.total_wh += 10
+        await wait_for_state(hass, energy, "12.04")
+        assert shown <= {"12.0", "12.03", "12.04", "unavailable", "unknown"}
+        assert not_counted(hass) == []
+
+
+def set_meter(box: EvboxChargePoint | EwsBox, total: float) -> None:
+    """Let the meter of the first connector have counted so much, Wh."""
+    if isinstance(box, EwsBox):
+        box.ports[0].session.total_wh = total
+    else:
+        box.modules[0].energy_wh = total
 
 
 @pytest.mark.parametrize(

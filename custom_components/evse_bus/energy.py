@@ -100,6 +100,10 @@ class MeterTotal:
             self._gap = meter - stored.meter
             self._began = clocks.monotonic
         offset = self._offsets.get(generation)
+        if offset is None and self._gap is not None and stored and stored.meter:
+            # The meter that was read first was perhaps not yet itself: this one
+            # may continue the stored total.
+            self._gap = meter - stored.meter
         if offset is None:
             # Another meter: what it has counted before is no consumption.
             offset = 0.0 if total is None else total - meter
@@ -115,8 +119,9 @@ class MeterTotal:
     def _judge_gap(self, clocks: Clocks, current: float) -> None:
         """Count the energy of an absence, or drop it, as soon as this can be decided.
 
-        The computer may have started with a wrong time: energy that is too much for
-        the absence by the wall clock waits for `PATIENCE`.
+        The computer may have started with a wrong time, and a meter may begin at 0
+        and be back at its total soon: what is too much for the absence by the wall
+        clock, or has fallen, waits for `PATIENCE`.
         """
         gap, stored = self._gap, self._stored
         if gap is None or stored is None or self.total is None:
@@ -126,7 +131,7 @@ class MeterTotal:
         if 0 <= gap <= most_energy(away, current):
             self.total += gap
             self._offsets = {one: by + gap for one, by in self._offsets.items()}
-        elif gap >= 0 and running < PATIENCE:
+        elif running < PATIENCE:
             return
         else:
             self.not_counted = gap
@@ -217,14 +222,16 @@ class TotalStore(Observable):
 
     @callback
     def put(self, key: str, record: MeterRecord) -> None:
-        """Take a record, and write it soon if `STEP` or another meter is new."""
+        """Take a record; write it soon if `STEP` is new, at once for another meter."""
         self._records[key] = record
         stored = self._on_disk.get(key)
         if stored is None or (
             record.total - stored.total >= STEP
             or abs(_offset(record) - _offset(stored)) >= 1
         ):
-            self._write_soon()
+            self._write_soon(
+                at_once=stored is None or _offset(record) != _offset(stored)
+            )
 
     async def async_hand_over(self, old: str, new: str) -> None:
         """Continue the totals of a box with the meters of the one that replaces it."""
@@ -267,9 +274,9 @@ class TotalStore(Observable):
             self._on_disk = records
         self.updated()
 
-    def _write_soon(self) -> None:
+    def _write_soon(self, *, at_once: bool = False) -> None:
         pause = 0.0
-        if self._written_at is not None:
+        if self._written_at is not None and not at_once:
             pause = self._written_at + INTERVAL - self._hass.loop.time()
         self._next_write.plan(max(pause, 0.0))
 

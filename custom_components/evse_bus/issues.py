@@ -107,7 +107,7 @@ class BusIssues:
             present=True,
             placeholders={
                 "charger": self._name(managed),
-                "energy": f"{energy / 1000:+.1f}",
+                "energy": f"{energy / 1000:+.5g}",
             },
         )
 
