@@ -8,6 +8,7 @@ from homeassistant.data_entry_flow import FlowResultType
 import pytest
 
 from custom_components.evse_bus.evse.protocols import PROTOCOLS
+from tests.common import bus_entry, charger as stored_charger
 from tests.flow import NOWHERE, charger, fields, port_step
 from tests.virtual import (
     AblBox,
@@ -135,6 +136,30 @@ async def test_searching_again_finds_a_box_switched_on_meanwhile(
         await flow.wait()
         assert flow.step == "select"
         flow.abort()
+
+
+async def test_box_that_another_bus_has_is_shown_and_not_offered(
+    hass: HomeAssistant,
+) -> None:
+    here = stored_charger("abl", 9, serial="2W22xy00000005", title="Left")
+    bus_entry("abl", NOWHERE, here, title="Garage").add_to_hass(hass)
+    moved = AblBox(5, serial="2W22xy00000005")
+    with VirtualBus.in_loop(moved) as bus:
+        flow = await port_step(hass, "abl", bus.url)
+        await flow.wait()
+        assert flow.step == "nothing_new"
+        assert flow.result["menu_options"] == ["scan", "manual", "port"]
+        assert flow.tells("Left (Garage)", "remove it where it is set up")
+        bus.add(AblBox(6, serial="2W22xy00000006"))
+        await flow.choose("scan")
+        await flow.wait()
+        assert flow.step == "select"
+        assert flow.tells("Already set up: Left (Garage)")
+        assert fields(flow)["chargers"] == ["6"]
+        await flow.submit({"chargers": ["6"], "installation_limit": 16})
+        assert flow.step == "charger"
+        flow.abort()
+        assert not moved.writes
 
 
 async def test_typed_by_hand_keeps_the_serial_that_was_read(

@@ -74,6 +74,48 @@ def test_another_meter_never_makes_a_step(
         before[generation] = meter
 
 
+@given(meters, meters, st.floats(0, 1000))
+def test_the_meter_of_another_box_continues_the_total(
+    total: float, meter: float, rise: float
+) -> None:
+    """Whatever it has counted before, and however long the exchange took."""
+    continued = MeterTotal(MeterRecord(total, None, NOW.wall - DAY))
+    assert continued.update(meter, 0, NOW) == pytest.approx(total)
+    after = later(PATIENCE + 1)
+    assert continued.update(meter + rise, 0, after) == pytest.approx(
+        total + rise, abs=1e-6 * (1 + meter)
+    )
+    assert continued.not_counted is None
+    record = continued.record(after)
+    assert record is not None
+    assert record.meter == meter + rise
+
+
+async def test_totals_are_handed_over(
+    hass: HomeAssistant, hass_storage: dict[str, Any]
+) -> None:
+    store = TotalStore(hass)
+    await store.async_load()
+    for key in ("evbox_1_1_energy", "evbox_1_2_energy", "evbox_12_1_energy"):
+        store.put(key, MeterRecord(7000, 5000, NOW.wall))
+    await store.async_hand_over("evbox_1", "evbox_9")
+    stored = hass_storage[TOTALS_KEY]["data"]
+    assert stored["evbox_9_2_energy"] == {
+        "total": 7000,
+        "meter": None,
+        "wall": NOW.wall,
+    }
+    assert len(stored) == 5
+    again = TotalStore(hass)
+    await again.async_load()
+    assert again.get("evbox_9_1_energy") == MeterRecord(7000, None, NOW.wall)
+    # Not those of a serial number that begins alike.
+    await again.async_forget("evbox_1")
+    assert set(hass_storage[TOTALS_KEY]["data"]) == {
+        *("evbox_9_1_energy", "evbox_9_2_energy", "evbox_12_1_energy"),
+    }
+
+
 def test_a_meter_that_reads_zero_for_a_while_is_counted_once() -> None:
     total = MeterTotal()
     assert total.update(5000, 0, NOW) == 5000

@@ -31,9 +31,17 @@ from tests.common import (
     wait_for_state,
     wait_until,
 )
-from tests.flow import NOWHERE, Flow, charger, issue, port_step
+from tests.flow import NOWHERE, Flow, charger, issue, offers, port_step
 from tests.listening import dialling, listening, offered
-from tests.virtual import AblBox, EvboxChargePoint, EwsBox, Module, VirtualBus
+from tests.virtual import (
+    AblBox,
+    EvboxChargePoint,
+    EwsBox,
+    Module,
+    SmartEvse,
+    VirtualBus,
+)
+from tests.virtual.device import Device
 
 if TYPE_CHECKING:
     from homeassistant.config_entries import ConfigEntry
@@ -500,6 +508,8 @@ async def test_a_box_that_turns_out_to_be_set_up_elsewhere_is_taken_off(
         new_bus.add(two)
         await wait_until(hass, lambda: issues(hass) == {"set_up_twice_01B"})
         await wait_until(hass, lambda: list(new.runtime_data.chargers) == ["abl2"])
+        await hass.async_block_till_done()
+        assert issues(hass) == {"set_up_twice_01B"}
         writes = len(two.writes)
         # The rest of its bus runs on, and it is silent, also after a restart.
         assert state_of(hass, status) == "available"
@@ -521,3 +531,88 @@ async def test_a_box_that_turns_out_to_be_set_up_elsewhere_is_taken_off(
         for entry in (old, new):
             if entry.state is ConfigEntryState.LOADED:
                 await hass.config_entries.async_unload(entry.entry_id)
+
+
+@pytest.mark.usefixtures("socket_enabled")
+@pytest.mark.parametrize("older", ["line", "network"])
+async def test_an_ews_box_on_a_line_and_on_the_network_has_one_master(
+    hass: HomeAssistant, older: str
+) -> None:
+    """Typed in on RS-232 without its serial number; it may be connected both ways."""
+    serial = "012345678901"
+    on_line, on_network = EwsBox(serial=serial), EwsBox(serial=serial)
+    known = stored_charger("ews", serial, serial=serial, title="Known")
+    known = {**known, "subentry_id": "02"}
+    anyone = stored_charger("ews", "", title="Anyone")
+    anyone = {**anyone, "subentry_id": "01" if older == "line" else "03"}
+    async with listening(hass, known) as network:
+        with (
+            dialling(network, on_network),
+            VirtualBus.in_loop(on_line) as bus,
+        ):
+            await get_entity(hass, "sensor", network, "2_status")
+            line = await setup_bus(hass, "ews", bus.url, anyone, entry_id="line")
+            second = known if older == "line" else anyone
+            reported = {f"set_up_twice_{second['subentry_id']}"}
+            await wait_until(hass, lambda: issues(hass) == reported)
+            entries = (line, network) if older == "line" else (network, line)
+            first, other = (entry.runtime_data for entry in entries)
+            await wait_until(hass, lambda: not other.chargers)
+            assert len(first.chargers) == 2
+            box = on_network if older == "line" else on_line
+            writes = len(box.writes)
+            limit = await get_entity(hass, "number", entries[0], "2_charging_current")
+            await call(hass, "number.set_value", limit, value=9)
+            await hass.async_block_till_done()
+            assert issues(hass) == reported
+            assert len(box.writes) == writes
+            # Nor is it offered as an unknown box.
+            assert not offers(hass)
+            await hass.config_entries.async_unload("line")
+
+
+# -- The scheme: after the first release, a change needs a migration ---------------------
+
+
+@pytest.mark.parametrize(
+    ("device", "last", "prefix"),
+    [
+        (AblBox(3, serial="2W22xy03"), "1_estimated_energy", "abl_2W22xy03"),
+        (EvboxChargePoint(77, 1, min_interval=0), "1_energy", "evbox_77"),
+        (EwsBox(serial="728000000012"), "2_energy", "ews_728000000012"),
+        (SmartEvse("later", serial=4711), "charging_current", "smartevse1"),
+    ],
+    ids=["abl", "evbox", "ews", "smartevse"],
+)
+async def test_what_stands_on_the_identity(
+    hass: HomeAssistant,
+    hass_storage: dict[str, Any],
+    *,
+    device: Device,
+    last: str,
+    prefix: str,
+) -> None:
+    ports = [f"{prefix}_1", f"{prefix}_2"] if prefix.startswith("ews") else []
+    async with running(hass, device, poll_interval=0.5) as (entry, _):
+        has_meter = last.endswith("energy")
+        platform = "sensor" if has_meter else "number"
+        entity = await get_entity(hass, platform, entry, last)
+        await wait_for_state(hass, entity, lambda state: state.state)
+        await hass.async_block_till_done()
+        registry = dr.async_get(hass)
+        keys = [
+            key
+            for one in (
+                *dr.async_entries_for_config_entry(registry, "bus"),
+                *dr.async_child_entries_for_config_entry(registry, "bus"),
+            )
+            for _, key in one.identifiers
+        ]
+        assert sorted(keys) == sorted(["bus", prefix, *ports])
+        assert all(one.unique_id.startswith(f"{prefix}_") for one in ours(hass))
+        await shut_down(hass, entry)
+    kind = "serial" if has_meter else "subentry"
+    orders = [f"{kind}:{one}" for one in ports or [prefix]]
+    assert sorted(hass_storage[ORDERS_KEY]["data"]) == orders
+    totals = hass_storage.get(TOTALS_KEY, {"data": {}})["data"]
+    assert (f"{prefix}_{last}" in totals) is has_meter

@@ -7,7 +7,7 @@ from datetime import timedelta
 import json
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
+from unittest.mock import Mock, patch
 
 from homeassistant.config_entries import ConfigEntryState, ConfigSubentry
 from homeassistant.const import EVENT_HOMEASSISTANT_FINAL_WRITE
@@ -24,12 +24,14 @@ from pytest_homeassistant_custom_component.common import async_fire_time_changed
 from custom_components.evse_bus.const import DOMAIN
 from custom_components.evse_bus.evse.errors import RefusedOrderError
 from custom_components.evse_bus.evse.model import CurrentLimit, Orders
+from custom_components.evse_bus.evse.safety import cautious
 from custom_components.evse_bus.stores.orders import (
     KNOWN_KEY,
     ORDERS_KEY,
     RETRY_LIMIT,
     OrderStore,
     Record,
+    allows_more,
     decode,
     encode,
     stopped,
@@ -583,6 +585,32 @@ async def test_a_serial_number_that_becomes_known_takes_the_orders_along(
         await hass.config_entries.async_setup(entry.entry_id)
         await wait_for_state(hass, limit, "12.0")
         await hass.config_entries.async_unload(entry.entry_id)
+
+
+@given(orders, orders, st.none() | orders)
+def test_another_box_gets_no_more_than_the_box_before(
+    first: Orders, before: Orders, earlier: Orders | None
+) -> None:
+    """Nor more than a new one, nor than it was allowed itself at another time."""
+    hass = Mock(data={})
+    hass.config.config_dir = hass.config.path.return_value = "/nowhere"
+    store = OrderStore(hass)
+    store._records = {
+        "serial:evbox_1": Record(before, "here"),
+        "serial:evbox_5": Record(before, "elsewhere"),
+    }
+    if earlier is not None:
+        store._records["serial:evbox_2"] = Record(earlier, "before")
+    store.hand_over("here", "serial:evbox_2", first)
+    order = store.get("serial:evbox_2")
+    assert isinstance(order, Orders)
+    for one in (first, before, earlier):
+        assert one is None or not allows_more(order, one)
+    # The old box keeps its own, without a claim on this place.
+    assert store._records["serial:evbox_1"] == Record(before, "")
+    assert store._records["serial:evbox_5"] == Record(before, "elsewhere")
+    store.hand_over("here", "serial:evbox_3", first)
+    assert store.get("serial:evbox_3") == cautious(first, order)
 
 
 # -- The store alone -------------------------------------------------------------

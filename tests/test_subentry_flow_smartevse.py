@@ -8,7 +8,13 @@ from homeassistant.data_entry_flow import FlowResultType
 import pytest
 from pytest_homeassistant_custom_component.common import MockConfigEntry
 
-from tests.common import charger as stored_charger, setup_bus
+from tests.common import (
+    call,
+    charger as stored_charger,
+    get_entity,
+    setup_bus,
+    wait_for_state,
+)
 from tests.flow import NOWHERE, Flow, charger, fields
 from tests.virtual import SmartEvse, VirtualBus
 
@@ -289,6 +295,26 @@ async def test_slave_is_changed_in_place(hass: HomeAssistant) -> None:
         assert right.unique_id is None
         assert right.data["address"] == 4
         assert right.data["installation_limit"] == 13
+        assert bus.opened == 1
+        await take_down(hass, entry)
+
+
+async def test_slave_is_replaced_and_keeps_its_entities(hass: HomeAssistant) -> None:
+    """Nothing tells one box from another; the user says that it is another one."""
+    box = slave(2)
+    with VirtualBus.in_loop(box) as bus:
+        entry = await master_bus(hass, bus.url, 2)
+        limit = await get_entity(hass, "number", entry, "charging_current")
+        await call(hass, "number.set_value", limit, value=12)
+        flow = await Flow.replace_charger(hass, entry, get(entry, "Charger 2"))
+        assert not fields(flow)
+        await flow.submit({})
+        assert flow.result["reason"] == "reconfigure_successful"
+        await wait_for_state(hass, limit, "6.0")
+        stored = get(entry, "Charger 2")
+        assert stored.unique_id is None
+        assert stored.data["identity"] != stored.subentry_id
+        assert await get_entity(hass, "number", entry, "charging_current") == limit
         assert bus.opened == 1
         await take_down(hass, entry)
 

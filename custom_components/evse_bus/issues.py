@@ -167,11 +167,12 @@ class BusIssues:
     def check(self, managed: ManagedCharger) -> None:
         """Report or clear the faults of a charger."""
         charger = managed.charger
-        config = charger.config
+        # Most updates have none: their texts are not made.
+        texts = {"charger": self._name(managed)} if charger.faults else {}
         is_duplicate = Fault.DUPLICATE_ADDRESS in charger.faults
         if managed.is_primary_port:
             # Once for a box with several ports.
-            self._check_wrong_charger(managed)
+            self._check_wrong_charger(managed, texts)
         faults = {
             NO_SUCH_PORT: Fault.NO_SUCH_PORT in charger.faults,
             DUPLICATE_ADDRESS: is_duplicate and not charger.shares_address,
@@ -182,29 +183,31 @@ class BusIssues:
                 key,
                 managed.key,
                 present=present,
-                placeholders={
-                    "charger": self._name(managed),
-                    "address": self._protocol.address.label(config.address),
-                },
+                placeholders=texts
+                | {"address": self._protocol.address.label(charger.config.address)},
             )
-        self._check_firmware(managed)
+        self._check_firmware(managed, texts)
         self._check_timeout(managed)
 
-    def _check_wrong_charger(self, managed: ManagedCharger) -> None:
+    def _check_wrong_charger(
+        self, managed: ManagedCharger, texts: dict[str, str]
+    ) -> None:
         """Report another box in the place of a charger: exchanged, or swapped."""
         charger = managed.charger
-        present = Fault.WRONG_CHARGER in charger.noticed
-        found = charger.other_serial if present else None
+        if Fault.WRONG_CHARGER not in charger.noticed:
+            self._set(WRONG_CHARGER, managed.key, present=False)
+            return
+        found = charger.other_serial
         other = holder(self._hass, self._protocol.identity(found))
         # A box that is set up elsewhere has not replaced this one.
         replaced = found is not None and other is None
         self._set(
             WRONG_CHARGER,
             managed.key,
-            present=present,
+            present=True,
             placeholders={
                 **another_box_texts(self._protocol, managed.subentry),
-                "charger": self._name(managed),
+                **texts,
                 "expected": charger.config.serial or "?",
                 "found": found or "?",
                 "other": "-" if other is None else other.name,
@@ -226,7 +229,7 @@ class BusIssues:
             return managed.name
         return given if managed.port_count == 1 else f"{given} {managed.port_number}"
 
-    def _check_firmware(self, managed: ManagedCharger) -> None:
+    def _check_firmware(self, managed: ManagedCharger, texts: dict[str, str]) -> None:
         """Report a firmware that is unknown, or that this protocol does not support."""
         charger = managed.charger
         present = Fault.UNSUPPORTED_FIRMWARE in charger.faults
@@ -236,10 +239,7 @@ class BusIssues:
                 key,
                 managed.key,
                 present=present and (key == UNKNOWN_FIRMWARE) == (firmware is None),
-                placeholders={
-                    "charger": self._name(managed),
-                    "firmware": firmware or "-",
-                },
+                placeholders=texts | {"firmware": firmware or "-"},
             )
 
     def _check_timeout(self, managed: ManagedCharger) -> None:
@@ -251,14 +251,14 @@ class BusIssues:
         if interval is None:
             return
         ordered = charger.effective_orders.fail_safe_timeout
-        if ordered >= INTERVALS_PER_TIMEOUT * interval:
+        used = charger.setpoint.fail_safe_timeout
+        if ordered >= INTERVALS_PER_TIMEOUT * interval or used <= ordered:
             self._set(TIMEOUT_RAISED, managed.key, present=False)
             return
-        used = charger.setpoint.fail_safe_timeout
         self._set(
             TIMEOUT_RAISED,
             managed.key,
-            present=used > ordered,
+            present=True,
             placeholders={
                 "charger": self._name(managed),
                 "interval": f"{interval:g}",

@@ -87,10 +87,10 @@ class BusDevices:
                 registry.async_update_device(device.id, new_identifiers={(DOMAIN, new)})
         entities = er.async_get(self._hass)
         for entity in er.async_entries_for_config_entry(entities, entry_id):
-            if entity.config_subentry_id == subentry_id:
-                entities.async_update_entity(
-                    entity.entity_id, new_unique_id=renamed(entity.unique_id)
-                )
+            key = renamed(entity.unique_id)
+            taken = entities.async_get_entity_id(entity.domain, DOMAIN, key)
+            if entity.config_subentry_id == subentry_id and taken is None:
+                entities.async_update_entity(entity.entity_id, new_unique_id=key)
 
     def _child(self, key: str) -> ChildDeviceEntry | None:
         return self._registry.async_get_child_device_by_identifier(

@@ -133,13 +133,13 @@ class BusChargers:
             for key in self.all.keys() - configured.keys():
                 await self._async_remove_charger(self.all[key])
             self._duplicates = self._find_duplicates()
-            self.issues.set_up_twice(self._duplicates)
             # All ports of a box together, before the first one of another box.
             for one in tuple(self.all.values()):
                 if one.subentry_id in self._duplicates or one.identity != identity_of(
                     configured[one.key][0]
                 ):
                     await self._async_take_off(one)
+            self.issues.set_up_twice(self._duplicates)
             for key, (subentry, config) in configured.items():
                 if subentry.subentry_id in self._duplicates:
                     continue
