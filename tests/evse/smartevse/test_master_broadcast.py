@@ -33,7 +33,7 @@ def test_it_listens_then_reads_then_broadcasts() -> None:
             first = scene.broadcasts()[0]
             before = [s for s in scene.line.sent if s.when < first.when]
             # Status and settings of both, and nothing written.
-            assert len(before) == 10
+            assert len(before) == 8
             assert {sent.data[1] for sent in before} == {4}
             assert first.when - begin < LISTENING + 0.5
 

@@ -177,7 +177,7 @@ def test_a_pause_that_was_undone_meanwhile_stands_again(
                 scene.charger = scene.make_charger()
                 scene.bus.add(scene.charger)
             took = await scene.until(lambda: not scene.outlet.access)
-            assert took < (QUIET + 1.0 if dialect is LATER else 2.5)
+            assert took < (QUIET + 1.0 if dialect in LATER else 2.5)
 
     simulate(run())
 
