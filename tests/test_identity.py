@@ -580,7 +580,7 @@ async def test_an_ews_box_on_a_line_and_on_the_network_has_one_master(
         (AblBox(3, serial="2W22xy03"), "1_estimated_energy", "abl_2W22xy03"),
         (EvboxChargePoint(77, 1, min_interval=0), "1_energy", "evbox_77"),
         (EwsBox(serial="728000000012"), "2_energy", "ews_728000000012"),
-        (SmartEvse("later", serial=4711), "charging_current", "smartevse1"),
+        (SmartEvse("2.30+", serial=4711), "charging_current", "smartevse1"),
     ],
     ids=["abl", "evbox", "ews", "smartevse"],
 )
