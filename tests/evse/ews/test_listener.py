@@ -1,6 +1,7 @@
 """Boxes that dial, and the bus of each."""
 
 import asyncio
+from typing import override
 
 import pytest
 
@@ -44,6 +45,36 @@ def test_a_bus_waits_for_its_box_to_dial() -> None:
             assert not first(bus).available
             with pytest.raises(Exception, match="not connected"):
                 await first(bus).change_orders(OrderChange(current=10.0))
+
+    run(scene)
+
+
+class DamagedBox(VirtualBox):
+    """Its first replies to ``rs`` have another serial number; their checksum fits."""
+
+    damaged = 1
+
+    @override
+    def send(self, data: bytes, turn_round: float, silence: float = 0.0) -> None:
+        if data[3:6] == b"Ars" and self.damaged:
+            self.damaged -= 1
+            changed = bytearray(data)
+            # The last digit, and the size of the web page.
+            changed[6 + 23] ^= 2
+            changed[6 + 24] ^= 2
+            data = bytes(changed)
+        super().send(data, turn_round, silence)
+
+
+def test_a_box_that_dials_is_found_by_two_replies_that_agree() -> None:
+    async def scene() -> None:
+        found: list[UnknownBox] = []
+        async with server(on_unknown_box=found.append) as made:
+            box = DamagedBox(serial=SERIAL)
+            with dialling(made, box):
+                await until(lambda: found)
+                assert box.damaged == 0
+                assert [one.serial for one in found] == [SERIAL]
 
     run(scene)
 
