@@ -66,6 +66,24 @@ def test_its_checksum_is_used_at_once(
     simulate(run())
 
 
+@pytest.mark.parametrize("bcc", ["all", "without_msgid"])
+def test_a_box_with_the_other_checksum_in_its_place(bcc: str) -> None:
+    """What is remembered of a line may be of another box."""
+
+    async def run() -> None:
+        scene = EwsScene(options={"bcc": bcc}, expected=None)
+        async with scene:
+            await scene.until(lambda: scene.charger().reading is not None)
+            scene.options = {"bcc": "without_msgid" if bcc == "all" else "all"}
+            scene.make_box()
+            before = scene.charger().box.bcc
+            took = await scene.until(lambda: scene.charger().box.bcc is not before)
+            assert took < 10
+            await scene.until(lambda: scene.charger().available, 1.0)
+
+    simulate(run())
+
+
 def test_after_a_long_absence_the_limit_is_back_within_ten_seconds() -> None:
     """After a power failure it may charge without a limit: it is looked for often."""
 

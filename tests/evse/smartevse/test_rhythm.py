@@ -6,13 +6,19 @@ from hypothesis import given, settings, strategies as st
 import pytest
 
 from custom_components.evse_bus.evse.bus import Bus
+from custom_components.evse_bus.evse.model import Fault
 from custom_components.evse_bus.evse.smartevse import POLLED
 from custom_components.evse_bus.evse.smartevse.dialects import Dialect
-from custom_components.evse_bus.evse.smartevse.master import STILL_CHARGING
+from custom_components.evse_bus.evse.smartevse.master import (
+    LISTENING,
+    STAY_SILENT,
+    STILL_CHARGING,
+)
 from custom_components.evse_bus.evse.smartevse.polled import QUIET
 from custom_components.evse_bus.evse.smartevse.sharing import STOPS_ALONE
 from tests.simulated_time import now, simulate
 
+from .frames import frame
 from .polled_scene import ALL, HEAD, LATER, PolledScene
 from .scene import MasterScene
 from .test_polled_quiet import quiets
@@ -248,6 +254,51 @@ def test_slaves_go_on_across_a_reload(away: float) -> None:
                 assert offers == [8.0, 8.0]
             first = next(one.when for one in scene.broadcasts(begin))
             assert first - begin < 1.0
+
+    simulate(run())
+
+
+OTHER_MASTER = frame("001000010004080064003c00000000")
+"""A broadcast to slaves of 2.17."""
+
+
+@pytest.mark.parametrize("after", [0.5, 5.0])
+def test_after_a_reload_it_listens_where_another_master_was(after: float) -> None:
+    """It broadcast itself a moment ago, and is not the only one any more."""
+
+    async def run() -> None:
+        async with MasterScene(watch=False) as scene:
+            await asyncio.sleep(6)
+            await scene.until(lambda: now() > scene.line.busy_until + 0.01)
+            scene.line.send(OTHER_MASTER)
+            await asyncio.sleep(after)
+            assert scene.master.noticed == {Fault.SECOND_MASTER}
+            sent = len(scene.line.sent)
+            await scene.bus.stop()
+            scene.new_bus(reload=True)
+            scene.add(2)
+            scene.add(3)
+            await scene.bus.start()
+            await asyncio.sleep(LISTENING - 0.1)
+            assert len(scene.line.sent) == sent
+
+    simulate(run())
+
+
+def test_silence_beside_another_master_outlasts_a_lost_port() -> None:
+    async def run() -> None:
+        async with MasterScene(watch=False) as scene:
+            await asyncio.sleep(6)
+            await scene.until(lambda: now() > scene.line.busy_until + 0.01)
+            scene.line.send(OTHER_MASTER)
+            await asyncio.sleep(5)
+            sent = len(scene.line.sent)
+            scene.line.unplug()
+            await asyncio.sleep(STAY_SILENT - 10)
+            assert scene.line.is_open
+            assert len(scene.line.sent) == sent
+            await asyncio.sleep(15)
+            assert len(scene.line.sent) > sent
 
     simulate(run())
 

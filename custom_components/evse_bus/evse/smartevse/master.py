@@ -530,6 +530,8 @@ class Master(BusMaster):
         """Silence the whole bus beside another master."""
         is_new = self._phase is not _Phase.SILENCED
         self._phase = _Phase.SILENCED
+        # The next bus on this line must listen first, however soon it comes.
+        self._memory.broadcast_at = -inf
         self._forget(now + STOPS_ALONE)
         self._wait(now + STAY_SILENT)
         self.notice(Fault.SECOND_MASTER, present=True)
