@@ -432,6 +432,26 @@ async def test_lost_orders_stop_a_charger_until_the_user_allows_it(
         await hass.config_entries.async_unload(entry.entry_id)
 
 
+async def test_a_charger_in_the_device_registry_has_had_orders(
+    hass: HomeAssistant, hass_storage: dict[str, Any]
+) -> None:
+    """Both files are lost: only the registry tells it from a new one."""
+    box = AblBox(1)
+    with VirtualBus.in_loop(box) as bus:
+        entry = await setup_bus(hass, "abl", bus.url, charger_of(box))
+        await get_entity(hass, "number", entry, "charging_current")
+        await shut_down(hass, entry)
+        hass_storage.pop(ORDERS_KEY)
+        hass_storage.pop(KNOWN_KEY)
+
+        await hass.config_entries.async_setup(entry.entry_id)
+        switch = await get_entity(hass, "switch", entry, "charging_allowed")
+        await wait_for_state(hass, switch, "off")
+        await bus.wait_for_async(lambda: box.ic_amps == 0)
+        assert issues(hass) == {f"orders_lost_{ABL}"}
+        await hass.config_entries.async_unload(entry.entry_id)
+
+
 @pytest.mark.parametrize(
     "content", ["", "{", '{"version": 1}', "[]", "null", "\0" * 99]
 )
