@@ -77,7 +77,7 @@ HIDDEN_BY_ERROR: Final = 65.0
 """After an error, ``A`` may mean a plugged car for this long, s: a box waits for 60 s
 before it resumes."""
 HIDDEN_BY_START: Final = 10.0
-"""After its power-up likewise, s; 7 s were recorded."""
+"""After its power-up and after NO_COMM likewise, s; 7 s were recorded."""
 
 
 class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
@@ -314,8 +314,9 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
             hidden = HIDDEN_BY_ERROR if status.access else inf
         elif status.raw_state != UNPLUGGED:
             self._plug_hidden_until = 0.0
-        elif status.maximum is None and (before is None or before.maximum is not None):
-            # No cable was measured since it was switched on, perhaps just now.
+        elif before is None or (before.maximum is not None and status.maximum is None):
+            # Perhaps it was just switched on, or cleared NO_COMM: it knows of no cable,
+            # or was out of sight.
             hidden = HIDDEN_BY_START
         self._plug_hidden_until = max(self._plug_hidden_until, now + hidden)
 
