@@ -227,7 +227,8 @@ class DeviceIdChange:
             if self.change.serial is None or error.problem is Problem.IN_USE:
                 raise
             self._identify(self.change.serial)
-            if await self._who(turn, self.change.new) is not _Answer.OURS:
+            found = await self._who(turn, self.change.new, patience=REACH_ATTEMPTS)
+            if found is not _Answer.OURS:
                 raise
             return True
         return False
@@ -574,10 +575,10 @@ class DeviceIdChange:
         [serial] = replies
         return _Answer.OURS if serial.number == self._serial else _Answer.OTHER
 
-    async def _who(self, turn: Turn, address: int) -> _Answer:
+    async def _who(self, turn: Turn, address: int, *, patience: int = PAIR) -> _Answer:
         """Return what answers at a device-ID; asked again where that is not clear.
 
-        The last request ends this turn's look: what is written next follows it at once.
+        ``patience``: requests until it counts as silent. The last request ends this turn's look: what is written next follows it at once.
         """
         silent = unreadable = other = 0
         while True:
@@ -589,9 +590,9 @@ class DeviceIdChange:
             other = other + 1 if answer is _Answer.OTHER else 0
             if other == DOUBTFUL:
                 return answer
-            if silent == PAIR and not unreadable:
+            if silent == patience and not unreadable:
                 return answer
-            if silent + unreadable == MOST_DOUBTS:
+            if unreadable and silent + unreadable >= MOST_DOUBTS:
                 return _Answer.UNREADABLE
             await self._rest(turn, self._pauses.retry)
 
