@@ -6,8 +6,9 @@ from collections.abc import Awaitable, Callable
 import pytest
 
 from custom_components.evse_bus.evse.abl import PROTOCOL
+from custom_components.evse_bus.evse.model import OrderChange
 from tests.simulated_time import now
-from tests.virtual import AblBox
+from tests.virtual import AblBox, Car
 
 from .scene import Scene, config, orders, until
 
@@ -89,3 +90,38 @@ async def test_a_box_that_is_polled_seldom_is_asked_twice_each_time() -> None:
         assert charger.available
         assert not any(gone)
         assert charger.statistics.timeouts >= 9
+
+
+@pytest.mark.parametrize(("idle", "poll_interval"), [(1.0, 2.0), (10.0, 15.0)])
+async def test_an_adapter_that_closes_idle_lines_costs_nothing(
+    idle: float, poll_interval: float
+) -> None:
+    """Each time the box is identified anew; nothing is written, nothing flaps."""
+    car = Car(max_current=32.0)
+    box = AblBox(1, car=car, sleep_after=20.0)
+    async with Scene(box) as scene:
+        charger = scene.add(config(poll_interval=poll_interval), orders(10))
+        await until(lambda: charger.available)
+        car.plug_in()
+        await asyncio.sleep(3 * poll_interval)
+        closing = asyncio.create_task(close_when_idle(scene, idle))
+        gone: list[bool] = []
+        charger.subscribe(lambda: gone.append(charger.reading is None))
+        before = len(scene.writes())
+        await asyncio.sleep(20 * poll_interval)
+        assert scene.bus.line.statistics.opened > 15
+        assert len(scene.writes()) == before
+        assert not any(gone)
+        await charger.change_orders(OrderChange(current=8.0))
+        assert 7.9 < box.ic_amps <= 8.0
+        closing.cancel()
+
+
+async def close_when_idle(scene: Scene, idle: float) -> None:
+    """Close the line as some adapters do; it can be opened again at once."""
+    while True:
+        await asyncio.sleep(0.1)
+        line = scene.bus.line
+        if line.is_open and now() - line.last_activity > idle:
+            assert line._transport is not None
+            line._transport.close()

@@ -8,6 +8,7 @@ from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.dialling import UnknownBox
 from custom_components.evse_bus.evse.ews import PROTOCOL
 from custom_components.evse_bus.evse.ews.port import BoxPorts
+from custom_components.evse_bus.evse.model import OrderChange
 from tests.simulated_time import now, simulate
 from tests.virtual.ews_box import EwsBox as VirtualBox
 
@@ -102,6 +103,40 @@ def test_after_a_long_absence_the_limit_is_back_within_ten_seconds() -> None:
                 )
                 assert took < 10
                 await asyncio.sleep(30)
+
+    simulate(run())
+
+
+@pytest.mark.parametrize(("idle", "poll_interval"), [(1.0, 2.0), (10.0, 15.0)])
+def test_an_adapter_that_closes_idle_lines_costs_nothing(
+    idle: float, poll_interval: float
+) -> None:
+    """Each time the box is identified anew; no order is sent again."""
+
+    async def close_when_idle(scene: EwsScene) -> None:
+        while True:
+            await asyncio.sleep(0.1)
+            if scene.line.is_open and now() - scene.line.last_activity > idle:
+                scene.line.unplug()
+
+    async def run() -> None:
+        scene = EwsScene(config={"poll_interval": poll_interval})
+        async with scene:
+            await scene.until(
+                lambda: all(one.reading for one in scene.bus.chargers.values())
+            )
+            await scene.charge()
+            closing = asyncio.create_task(close_when_idle(scene))
+            gone: list[bool] = []
+            scene.watchers.append(lambda: gone.append(scene.charger().reading is None))
+            began = now()
+            await asyncio.sleep(20 * poll_interval)
+            assert scene.line.statistics.opened > 15
+            assert not scene.line.named("st", "sl", since=began)
+            assert not any(gone)
+            await scene.charger().change_orders(OrderChange(current=10.0))
+            assert scene.box.ports[0].limit == 10
+            closing.cancel()
 
     simulate(run())
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings, strategies as st
 import pytest
 
 from custom_components.evse_bus.evse.bus import Bus
-from custom_components.evse_bus.evse.model import Fault
+from custom_components.evse_bus.evse.model import Fault, OrderChange
 from custom_components.evse_bus.evse.smartevse import POLLED
 from custom_components.evse_bus.evse.smartevse.dialects import Dialect
 from custom_components.evse_bus.evse.smartevse.master import (
@@ -225,6 +225,43 @@ def test_whatever_happens_a_later_box_does_not_stop_with_no_comm(
             await asyncio.sleep(30)
             assert not any(error & NO_COMM for error in errors)
             assert scene.charger.available
+
+    simulate(run())
+
+
+@pytest.mark.parametrize("dialect", ALL)
+@pytest.mark.parametrize(("idle", "poll_interval"), [(1.5, 2.0), (15.0, 20.0)])
+def test_an_adapter_that_closes_idle_lines_takes_no_current(
+    dialect: Dialect, idle: float, poll_interval: float
+) -> None:
+    """A later box cannot confirm a current if its quiet takes longer than that."""
+    if dialect in LATER:
+        idle = max(idle, QUIET + 0.5)
+
+    async def close_when_idle(scene: PolledScene) -> None:
+        while True:
+            await asyncio.sleep(0.1)
+            if scene.line.is_open and now() - scene.line.last_activity > idle:
+                scene.line.unplug()
+
+    async def run() -> None:
+        scene = PolledScene(dialect, poll_interval=poll_interval)
+        async with scene:
+            await scene.settled()
+            await scene.charge()
+            await scene.polled(3)
+            closing = asyncio.create_task(close_when_idle(scene))
+            offers: list[float] = []
+            gone: list[bool] = []
+            scene.on_step.append(lambda: offers.append(scene.box.offers))
+            scene.on_step.append(lambda: gone.append(scene.charger.reading is None))
+            await asyncio.sleep(20 * poll_interval)
+            assert set(offers) == {10.0}
+            assert not any(gone)
+            for current in (8.0, 12.0):
+                await scene.charger.change_orders(OrderChange(current=current))
+                assert scene.box.offers == current
+            closing.cancel()
 
     simulate(run())
 
