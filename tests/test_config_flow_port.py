@@ -57,7 +57,10 @@ async def test_port_errors_are_told_apart(hass: HomeAssistant, tmp_path: Path) -
         assert flow.errors == {"device": "no_port"}
 
         await flow.submit({"device": bus.url, "line": {"baudrate": "nan"}})
-        assert flow.errors == {"base": "bad_baudrate"}
+        assert flow.errors == {"base": "bad_line_settings"}
+
+        await flow.submit({"device": bus.url, "line": {"reply_timeout": "nan"}})
+        assert flow.errors == {"base": "bad_line_settings"}
 
         await flow.submit({"device": bus.url, "line": {}})
         assert flow.step == "impose"

@@ -23,6 +23,45 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.usefixtures("quick_search")
 
 
+# -- A reply time-out by hand ---------------------------------------------------------
+
+
+@pytest.mark.parametrize("wait", [None, 8])
+async def test_a_reply_time_out_by_hand(
+    hass: HomeAssistant, wait: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An adapter with a round trip of 6 s is slower than what is learnt by itself."""
+    monkeypatch.setattr("tests.flow.PATIENCE", 900.0)
+    monkeypatch.setattr("tests.common.PATIENCE", 900.0)
+    box = AblBox(1)
+    with VirtualBus.in_loop(box) as bus:
+        bus.adapter.delay_out = bus.adapter.delay_in = 3.0
+        line = {} if wait is None else {"reply_timeout": wait}
+        flow = await port_step(hass, "abl", bus.url, **line)
+        await flow.wait()
+        if wait is None:
+            assert flow.step != "select"
+            flow.abort()
+            return
+        await flow.submit({"chargers": ["1"], "installation_limit": 16})
+        await flow.submit(charger("Box"))
+        await flow.submit()
+        entry = flow.result["result"]
+        assert entry.data["reply_timeout"] == wait
+        status = await get_entity(hass, "sensor", entry, "1_status")
+        await wait_for_state(hass, status, "available")
+        assert entry.runtime_data.bus.wire.round_trip.timeout == wait
+
+        # Left empty again, it is learnt again.
+        flow = await Flow.change_bus(hass, entry)
+        assert fields(flow)["line"]["reply_timeout"] == wait
+        await flow.submit({"device": bus.url, "line": {}})
+        assert "reply_timeout" not in entry.data
+        await hass.async_block_till_done()
+        assert entry.runtime_data.bus.wire.round_trip.timeout < wait
+        await hass.config_entries.async_unload(entry.entry_id)
+
+
 # -- Added ------------------------------------------------------------------------
 
 

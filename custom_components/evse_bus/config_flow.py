@@ -184,7 +184,7 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
         try:
             self.bus_data = bus_data(protocol, typed)
         except RefusedOrderError:
-            return {"base": "bad_baudrate"}
+            return {"base": "bad_line_settings"}
         device = self.bus_data[CONF_DEVICE]
         if not device:
             return {CONF_DEVICE: "no_port"}

@@ -18,6 +18,7 @@ from .const import (
     CONF_POLL_INTERVAL,
     CONF_PORTS,
     CONF_PROTOCOL,
+    CONF_REPLY_TIMEOUT,
     CONF_SERIAL,
     CONF_STOP_BITS,
     CONF_SUPPLY_LIMIT,
@@ -64,7 +65,9 @@ def protocol_of(data: Mapping[str, Any]) -> Protocol:
 def line_settings(data: Mapping[str, Any]) -> LineSettings:
     """Return the line settings: those of the protocol, unless overridden."""
     usual = protocol_of(data).settings
+    timeout = data.get(CONF_REPLY_TIMEOUT)
     return LineSettings(
+        reply_timeout=None if timeout is None else float(timeout),
         baudrate=int(data.get(CONF_BAUDRATE, usual.baudrate)),
         parity=data.get(CONF_PARITY, usual.parity),
         stop_bits=int(data.get(CONF_STOP_BITS, usual.stop_bits)),

@@ -8,12 +8,14 @@ from typing import ClassVar
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LineSettings:
-    """Coding of bytes on the wire; fixed by the protocol."""
+    """Coding of bytes on the wire, fixed by the protocol; and its reply time-out."""
 
     baudrate: int
     parity: str = "N"
     """``N``, ``E`` or ``O``."""
     stop_bits: int = 1
+    reply_timeout: float | None = None
+    """Set by the user for this line, s; ``None``: it follows what the line shows."""
 
     @property
     def byte_time(self) -> float:

@@ -6,7 +6,7 @@ such description for each way in which its chargers are used.
 """
 
 from collections.abc import Awaitable, Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from .address import AddressForm
@@ -168,7 +168,10 @@ class Protocol[C: ChargerConfig = Any]:
             group = self.master(circuit or Circuit())
         elif self.group is not None:
             group = self.group()
-        return Bus(line, self.framer(), self.timing, name, group=group)
+        timing, wanted = self.timing, line.settings.reply_timeout
+        if wanted is not None:
+            timing = replace(timing, reply_timeout=wanted, reply_timeout_limit=wanted)
+        return Bus(line, self.framer(), timing, name, group=group)
 
     def listen_at(
         self,

@@ -30,6 +30,7 @@ from ..const import (
     CONF_PARITY,
     CONF_POLL_INTERVAL,
     CONF_PROTOCOL,
+    CONF_REPLY_TIMEOUT,
     CONF_STOP_BITS,
 )
 from ..evse.errors import RefusedOrderError
@@ -54,6 +55,8 @@ SUGGESTED_LIMIT: Final = 16.0
 """Offered, but not a default: the user confirms the limit of the wiring, A."""
 DEFAULT_FAIL_SAFE_TIMEOUT: Final = 60
 """s"""
+REPLY_TIMEOUTS: Final = (0.1, 10)
+"""Range of a reply time-out set by hand, s."""
 SEARCH_CURRENTS: Final = ("0", "6")
 """Currents that a search may set, A: no more before a box has reported its maximum."""
 
@@ -194,6 +197,7 @@ def port_form(usual: LineSettings, more: vol.Schema | None = None) -> vol.Schema
         vol.Required(CONF_STOP_BITS, default=str(usual.stop_bits)): dropdown(
             CONF_STOP_BITS, ("1", "2")
         ),
+        vol.Optional(CONF_REPLY_TIMEOUT): quantity(*REPLY_TIMEOUTS, 0.1, "s"),
     }
     return vol.Schema(
         {
@@ -212,6 +216,7 @@ def port_suggestions(data: Mapping[str, Any], settings: LineSettings) -> dict[st
             CONF_BAUDRATE: settings.baudrate,
             CONF_PARITY: settings.parity.lower(),
             CONF_STOP_BITS: str(settings.stop_bits),
+            **{key: data[key] for key in (CONF_REPLY_TIMEOUT,) if key in data},
         },
     }
 
@@ -220,9 +225,10 @@ def bus_data(protocol: Protocol, typed: Mapping[str, Any]) -> dict[str, Any]:
     """Return the data of a config entry from a filled-in port form.
 
     Line settings are stored only where they differ from those of the protocol. Raises
-    RefusedOrderError for a baud rate that is not a number.
+    RefusedOrderError for a baud rate or time-out that is not a number.
     """
     line = typed[CONF_LINE]
+    timeout = line.get(CONF_REPLY_TIMEOUT)
     wanted = {
         CONF_BAUDRATE: int(number(line[CONF_BAUDRATE], CONF_BAUDRATE)),
         CONF_PARITY: line[CONF_PARITY].upper(),
@@ -237,6 +243,9 @@ def bus_data(protocol: Protocol, typed: Mapping[str, Any]) -> dict[str, Any]:
         CONF_PROTOCOL: protocol.key,
         CONF_DEVICE: typed[CONF_DEVICE].strip(),
         **{key: value for key, value in wanted.items() if value != usual[key]},
+        **(
+            {} if timeout is None else {CONF_REPLY_TIMEOUT: number(timeout, "time-out")}
+        ),
     }
 
 
