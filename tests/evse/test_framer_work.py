@@ -5,6 +5,8 @@ Work is counted in instructions, and the search for costly bytes is led by that 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
+from operator import xor
 
 from hypothesis import given, settings, strategies as st, target
 import pytest
@@ -24,6 +26,8 @@ from .work import instructions
 
 STREAM = 1500
 """Bytes of one stream; more than any framer keeps."""
+LONG = 0x4000
+"""Bytes of a stream after which a framer would show that it keeps more and more."""
 SIZES = (1, 5, 64, STREAM)
 """Bytes fed at once."""
 
@@ -126,3 +130,46 @@ COSTLY = {
 def test_patterns_that_were_costly(name: str, pattern: str, size: int) -> None:
     """In single bytes the first ones cost 74,000 (RTU) and 10,500 (EWS) a byte."""
     work_per_byte(KINDS[name], bytes.fromhex(pattern), size)
+
+
+def kept(framer: object) -> int:
+    """Return how many bytes and objects a framer keeps, in all its collections."""
+    return sum(
+        sum(len(one) if isinstance(one, list) else 1 for one in value.values())
+        if isinstance(value, dict)
+        else len(value)
+        if isinstance(value, bytearray | list)
+        else kept(value)
+        if hasattr(value, "__dict__")
+        else 0
+        for value in vars(framer).values()
+    )
+
+
+@pytest.mark.parametrize("name", KINDS)
+@settings(max_examples=40)
+@given(st.data())
+def test_what_is_kept_does_not_grow(name: str, data: st.DataObject) -> None:
+    """Nor does what a framer notes about the bytes."""
+    kind = KINDS[name]
+    pieces = st.lists(st.sampled_from(kind.pieces), min_size=1, max_size=30)
+    begin, pattern = b"".join(data.draw(pieces)), b"".join(data.draw(pieces))
+    framer = kind.make()
+    framer.feed(begin)
+    for _ in range(LONG // len(pattern) + 1):
+        framer.feed(pattern)
+    target(kept(framer))
+    assert kept(framer) <= 5 * kind.most_kept
+
+
+def test_messages_noted_inside_records_are_forgotten_with_them() -> None:
+    """Each round completes two info records, and notes a message inside the outer."""
+    framer = EwsFramer()
+    framer.feed(b"\x02\x04\x00Aid")
+    inside = b"\x02\x04\x00Aid" + bytes(2)
+    outer = b"\x02\x00\x0bIif" + inside
+    last = bytes((reduce(xor, outer[1:]),))
+    for _ in range(300):
+        for byte in outer + RECORD + bytes(1) + last:
+            framer.feed(bytes((byte,)))
+    assert kept(framer) < 100
