@@ -12,9 +12,10 @@ from homeassistant.core import HomeAssistant
 from homeassistant.data_entry_flow import FlowResultType
 import pytest
 
+from custom_components.evse_bus.evse.smartevse.polled import QUIET
 from tests.common import charger_of, running, setup_bus, subentry_id
-from tests.flow import IMPOSED, Flow, charger, port_step
-from tests.virtual import EvboxChargePoint, VirtualBus
+from tests.flow import IMPOSED, Flow, charger, port_step, smartevse_step
+from tests.virtual import Car, EvboxChargePoint, SmartEvse, VirtualBus
 
 INTERVAL = 20
 
@@ -128,3 +129,36 @@ async def test_an_entry_removed_and_added(hass: HomeAssistant) -> None:
         await asyncio.sleep(INTERVAL * 2)
         check(point, at_least=3)
         await hass.config_entries.async_unload(again.entry_id)
+
+
+async def test_a_later_smartevse_has_its_quiet_after_a_search_and_reloads(
+    hass: HomeAssistant,
+) -> None:
+    """Its car charges meanwhile, and is not stopped with NO_COMM."""
+    point = SmartEvse("2.30", car=Car(max_current=32.0))
+    with VirtualBus.in_loop(point) as bus:
+        assert point.car is not None
+        point.car.plug_in()
+        flow = await smartevse_step(hass, "polled", bus.url)
+        await flow.wait()
+        await flow.submit({"chargers": "1"})
+        await flow.submit(charger("Yard"))
+        await flow.submit()
+        assert flow.result["type"] is FlowResultType.CREATE_ENTRY
+        entry = flow.result["result"]
+        for pause in (9.0, 1.0, 4.0, 12.0):
+            await asyncio.sleep(pause)
+            assert point.error == 0
+            await hass.config_entries.async_reload(entry.entry_id)
+        await asyncio.sleep(30)
+        assert point.error == 0
+        assert point.contactor
+        await hass.config_entries.async_unload(entry.entry_id)
+        # Requests of one burst are less than a second apart.
+        quiets = [
+            later.t - one.end
+            for one, later in pairwise(bus.log.bursts())
+            if later.t - one.end > 1
+        ]
+        assert len(quiets) > 5
+        assert min(quiets) >= QUIET - 0.1
