@@ -65,7 +65,7 @@ def get(entry: MockConfigEntry, title: str) -> ConfigSubentry:
     return next(one for one in entry.subentries.values() if one.title == title)
 
 
-# -- Several boxes with one device-ID ---------------------------------------------------
+# -- Several boxes with one device-ID --------------------------------------------------
 
 
 async def duplicates(hass: HomeAssistant, bus: VirtualBus) -> Flow:
@@ -306,7 +306,7 @@ async def test_the_box_that_stays_on_may_be_one_that_is_set_up(
         flow.abort()
 
 
-# -- One charger --------------------------------------------------------------------------
+# -- One charger -----------------------------------------------------------------------
 
 
 async def new_address(

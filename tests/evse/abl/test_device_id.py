@@ -551,7 +551,7 @@ async def test_a_late_confirmation_of_the_reset_says_nothing_of_the_line() -> No
         assert trip.drain == 0
 
 
-# -- A charger that runs ----------------------------------------------------------------
+# -- A charger that runs ---------------------------------------------------------------
 
 
 async def test_a_charger_follows_its_box() -> None:

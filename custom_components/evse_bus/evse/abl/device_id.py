@@ -1,11 +1,11 @@
 """Another device-ID for one box, written to register 0x002C (PROTOCOLS.md, 2).
 
 Boxes with one device-ID obey the same writes, so nothing is written before it is proved
-that one box alone answers, by its serial number, and right before each write again. The
-sequence is E2, the device-ID, reset. It is not known whether the new one counts from its
-write or from the reset on: after the write the box is looked for at both. Once that was
-sent only a reset follows, so that no device-ID is left that a power cut would bring into
-effect later.
+that one box alone answers, by its serial number, and right before each write again.
+
+The sequence is E2, device-ID, reset. It is not known whether a device-ID counts from
+its write or from the reset on: after the write the box is looked for at both. Once it
+was sent only a reset follows: no device-ID is left that a power cut would bring in.
 """
 
 import asyncio
@@ -76,7 +76,7 @@ PAIR: Final = 2
 DOUBTFUL: Final = 2
 """Replies of another box in a row that are believed: checksums are weak."""
 MOST_DOUBTS: Final = 5
-"""Requests without a readable reply, not all of them silent, until that is the result."""
+"""Requests without a readable reply, some of them garbled, until that is believed."""
 WRITES: Final = 3
 """Attempts at each write; each one after a look at the box."""
 STATE_LOOKS: Final = 3
@@ -170,6 +170,7 @@ class DeviceIdChange:
         self.given_up = False
         """Its caller has gone: nothing is written unless it has begun."""
         self.progress: Progress = lambda _share: None
+        self._share = 0.0
         self._bus = bus
         self._readers = tuple(readers)
         self._own: AblCharger | None = None
@@ -204,9 +205,14 @@ class DeviceIdChange:
             await self._leave_old_set_up(turn)
             await self._enter_set_up(turn)
             await self._write_id(turn)
-        self.progress(0.8)
+        self._advance(0.8)
         await self._settle(turn)
         return await self._finish(turn)
+
+    def _advance(self, share: float) -> None:
+        """Report the progress, which never goes back."""
+        self._share = max(self._share, share)
+        self.progress(self._share)
 
     def ended_by(self, error: EvseError) -> EvseError:
         """Return the error for the caller when the line or the bus has ended it."""
@@ -292,7 +298,7 @@ class DeviceIdChange:
             clean = clean + 1 if answer is _Answer.OURS else 0
             unreadable += answer is _Answer.UNREADABLE
             other = other + 1 if answer is _Answer.OTHER else 0
-            self.progress(0.4 * clean / CLEAN_REPLIES)
+            self._advance(0.4 * clean / CLEAN_REPLIES)
             if clean == CLEAN_REPLIES:
                 return
             if unreadable == MOST_UNREADABLE or other == DOUBTFUL:
@@ -316,7 +322,7 @@ class DeviceIdChange:
                 silent, unreadable = 0, True
             except ReplyTimeoutError:
                 silent += 1
-                self.progress(0.4 + 0.2 * silent / SILENT_REQUESTS)
+                self._advance(0.4 + 0.2 * silent / SILENT_REQUESTS)
             except ExchangeRefusedError:
                 break
             else:
@@ -500,7 +506,7 @@ class DeviceIdChange:
             await self._write_state(turn, address, StateCode.RESET)
 
     async def _reset_unseen(self, turn: Turn) -> None:
-        """Reset a box that answers no reads; where another one does, nothing is sent."""
+        """Reset a box that answers no reads; nothing is sent where another one does."""
         for address in (self.change.old, self.change.new):
             if await self._who(turn, address) is not _Answer.SILENT:
                 return
@@ -516,7 +522,7 @@ class DeviceIdChange:
             self._own.move(self.change.new)
         enabled = not await self._restore(turn)
         self.done = replace(self.done, enabled=enabled)
-        self.progress(0.9)
+        self._advance(0.9)
         for _ in range(PAIR):
             await self._rest(turn, self._pauses.retry)
             at_old = await self._who(turn, self.change.old)
@@ -525,12 +531,13 @@ class DeviceIdChange:
             if at_old is not _Answer.SILENT:
                 self.done = replace(self.done, old_in_use=True)
                 break
-        self.progress(1.0)
+        self._advance(1.0)
         return self.done
 
     async def _restore(self, turn: Turn) -> bool:
         """Bring back limit and E0; return whether the outlet is as it was."""
         if self._own is not None:
+            await rest(worst_case=self._bus.worst_case(self._own))
             with suppress(EvseError):
                 await recover(self._own, turn, was_disabled=self._was_disabled)
                 return True
@@ -578,7 +585,8 @@ class DeviceIdChange:
     async def _who(self, turn: Turn, address: int, *, patience: int = PAIR) -> _Answer:
         """Return what answers at a device-ID; asked again where that is not clear.
 
-        ``patience``: requests until it counts as silent. The last request ends this turn's look: what is written next follows it at once.
+        ``patience``: requests until it counts as silent. What is written next follows
+        the last request at once, in the same turn.
         """
         silent = unreadable = other = 0
         while True:
