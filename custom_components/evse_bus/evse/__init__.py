@@ -37,6 +37,7 @@ from .errors import (
 )
 from .exchange import Turn
 from .framing import LineSettings
+from .memory import LineMemory
 from .model import (
     Capability,
     ChargerConfig,
@@ -84,6 +85,7 @@ __all__ = [
     "LineBusyError",
     "LineError",
     "LineLostError",
+    "LineMemory",
     "LineSettings",
     "Mode",
     "NotAvailableError",
