@@ -510,13 +510,14 @@ async def test_a_box_that_turns_out_to_be_set_up_elsewhere_is_taken_off(
         await wait_until(hass, lambda: list(new.runtime_data.chargers) == ["abl2"])
         await hass.async_block_till_done()
         assert issues(hass) == {"set_up_twice_01B"}
-        writes = len(two.writes)
+        # Its identity is read before anything is written.
+        assert not two.writes
         # The rest of its bus runs on, and it is silent, also after a restart.
         assert state_of(hass, status) == "available"
         assert await hass.config_entries.async_reload("new")
         await get_entity(hass, "sensor", new, "1_status", index=1)
         assert list(new.runtime_data.chargers) == ["abl2"]
-        assert len(two.writes) == writes
+        assert not two.writes
         assert issues(hass) == {"set_up_twice_01B"}
 
         if removed == "new":
@@ -561,6 +562,7 @@ async def test_an_ews_box_on_a_line_and_on_the_network_has_one_master(
             assert len(first.chargers) == 2
             box = on_network if older == "line" else on_line
             writes = len(box.writes)
+            assert older == "line" or not writes
             limit = await get_entity(hass, "number", entries[0], "2_charging_current")
             await call(hass, "number.set_value", limit, value=9)
             await hass.async_block_till_done()
@@ -569,6 +571,31 @@ async def test_an_ews_box_on_a_line_and_on_the_network_has_one_master(
             # Nor is it offered as an unknown box.
             assert not offers(hass)
             await hass.config_entries.async_unload("line")
+
+
+async def test_a_chargepoint_that_turns_out_to_be_set_up_elsewhere_is_let_go(
+    hass: HomeAssistant,
+) -> None:
+    """Each of its messages sets limits; the last one comes when its number is read."""
+    one, two = (EvboxChargePoint(77, 1, min_interval=0) for _ in range(2))
+    with VirtualBus.in_loop(one) as old_bus, VirtualBus.in_loop(two) as new_bus:
+        known = stored_charger("evbox", 77, serial="77", title="Old", poll_interval=0.5)
+        old = await setup_bus(
+            hass, "evbox", old_bus.url, {**known, "subentry_id": "01"}, entry_id="old"
+        )
+        anyone = stored_charger("evbox", 0, title="New", poll_interval=0.5)
+        new = await setup_bus(
+            hass, "evbox", new_bus.url, {**anyone, "subentry_id": "02"}, entry_id="new"
+        )
+        await wait_until(hass, lambda: issues(hass) == {"set_up_twice_02"})
+        await wait_until(hass, lambda: not new.runtime_data.chargers)
+        # Two replies have to agree on the number.
+        assert len(two.orders) == 2
+        limit = await get_entity(hass, "number", old, "charging_current")
+        await call(hass, "number.set_value", limit, value=9)
+        assert len(two.orders) == 2
+        for entry in (old, new):
+            await hass.config_entries.async_unload(entry.entry_id)
 
 
 # -- The scheme: after the first release, a change needs a migration ---------------------

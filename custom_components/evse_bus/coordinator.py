@@ -197,6 +197,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         """Handle a changed reading, state or configuration of a charger."""
         charger = managed.charger
         self.all_chargers.store_address(managed)
+        self.all_chargers.store_serial(managed)
         reading = charger.reading
         before = managed.connectors
         managed.connectors = (
@@ -225,7 +226,6 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         if structure == managed.structure:
             return
         managed.structure = structure
-        self.all_chargers.store_serial(managed)
         self.devices.register_charger(managed)
         self._add_entities(managed)
 

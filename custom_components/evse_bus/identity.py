@@ -90,6 +90,15 @@ class Holder(NamedTuple):
         """Return its name and that of its bus."""
         return f"{self.subentry.title} ({self.entry.title})"
 
+    @property
+    def age(self) -> tuple[str, str]:
+        """Return what orders subentries by age: their ids begin with the time."""
+        return self.subentry.subentry_id, self.entry.entry_id
+
+    def is_older(self, other: Holder) -> bool:
+        """Return whether it was added before another one."""
+        return self.age < other.age
+
 
 @callback
 def holders(hass: HomeAssistant, identity: str) -> list[Holder]:
@@ -105,8 +114,7 @@ def holders(hass: HomeAssistant, identity: str) -> list[Holder]:
         for subentry in entry.subentries.values()
         if identity in _identities(protocol_of(entry.data), subentry)
     ]
-    # The ids of subentries begin with the time.
-    return sorted(found, key=lambda one: (one.subentry.subentry_id, one.entry.entry_id))
+    return sorted(found, key=lambda one: one.age)
 
 
 def _identities(protocol: Protocol, subentry: ConfigSubentry) -> set[str | None]:

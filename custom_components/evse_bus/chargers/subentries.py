@@ -31,7 +31,7 @@ from ..discovery import async_set_up_now
 from ..energy import TOTALS
 from ..evse.model import ChargerConfig, Fault, Orders
 from ..evse.safety import cautious
-from ..identity import Holder, identity_of, older_holder, stands_on_serial
+from ..identity import Holder, holders, identity_of, older_holder, stands_on_serial
 from ..issues import BusIssues
 from ..stores.orders import ORDERS, charger_keys, stopped
 from .devices import BusDevices
@@ -189,6 +189,13 @@ class BusChargers:
             await other.runtime_data.all_chargers.async_settle()
         await self.async_sync()
 
+    def _accepts(self, managed: ManagedCharger, serial: str) -> bool:
+        """Return whether a box is no older subentry's: that would be its master."""
+        own = Holder(self._entry, managed.subentry)
+        identity = self._protocol.identity(serial)
+        found = [] if identity is None else holders(self._hass, identity)
+        return not any(one.is_older(own) for one in found)
+
     async def async_settle(self) -> None:
         """Wait until changes under way are made."""
         async with self._lock:
@@ -332,6 +339,7 @@ class BusChargers:
 
     def _put_on_bus(self, managed: ManagedCharger) -> None:
         charger, watcher = managed.charger, self._watcher
+        charger.accepts = partial(self._accepts, managed)
         charger.commit = partial(self._async_commit, managed)
         managed.subscriptions.append(
             charger.subscribe(partial(watcher.on_charger, managed))
@@ -369,13 +377,17 @@ class BusChargers:
         )
 
     def store_serial(self, managed: ManagedCharger) -> None:
-        """Store the first serial number read: no other box is accepted from then on."""
-        info = managed.charger.info
-        subentry = managed.subentry
-        if info is None or info.serial is None or subentry.data.get(CONF_SERIAL):
+        """Store the first serial number read: no other box is accepted from then on.
+
+        Also one that was not accepted: a restart knows then whose box it is.
+        """
+        charger, subentry = managed.charger, managed.subentry
+        if subentry.data.get(CONF_SERIAL):
             return
-        self._hass.config_entries.async_update_subentry(
-            self._entry,
-            subentry,
-            data={**subentry.data, CONF_SERIAL: info.serial},
-        )
+        serial = charger.info.serial if charger.info is not None else None
+        if Fault.WRONG_CHARGER in charger.noticed:
+            serial = charger.other_serial
+        if serial is not None:
+            self._hass.config_entries.async_update_subentry(
+                self._entry, subentry, data={**subentry.data, CONF_SERIAL: serial}
+            )

@@ -132,6 +132,12 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         """The orders were not renewed within their lifetime: the fail-safe counts."""
         self.commit: Callable[[Orders], Awaitable[None]] = _no_commit
         """Stores orders; awaited before a lowering is sent, after a raise."""
+        self.accepts: Callable[[str], bool] = _accept
+        """Return whether a box added without its serial number may have this one.
+
+        Called before anything is written, where the protocol reads it first: the box
+        may have another master.
+        """
         self.slot = Slot(kind=Kind.PROBE)
         self._conversations = 0
         self.bus: Scheduler | None = None
@@ -379,6 +385,12 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
             self.set_unavailable(why)
         self.slot.ready = self.slot.due = now + max(pause, self.minimum_pause(now))
 
+    def is_wrong(self, found: str | None, expected: str | None) -> bool:
+        """Return whether a serial number is that of another box than this one."""
+        if expected is not None:
+            return found != expected
+        return found is not None and not self.accepts(found)
+
     def on_wrong_charger(self, serial: str | None) -> None:
         """Take note of the serial number of the box that answers in its place."""
         if serial != self.other_serial:
@@ -609,6 +621,11 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
             now, ordered=self.setpoint.paused, shown=shown, patience=patience
         )
         self.notice(Fault.CHARGES_ALTHOUGH_PAUSED, present=against)
+
+
+def _accept(_serial: str) -> bool:
+    """Accept any box: the default for a script."""
+    return True
 
 
 async def _no_commit(_orders: Orders) -> None:

@@ -206,7 +206,7 @@ class AblReader(Charger[AblConfig]):
         info = await self._read_agreed(turn, INFO, self._info)
         expected = self.config.serial or self._serial
         serial = await self._read_serial(turn, expected)
-        if expected is not None and serial != expected:
+        if self.is_wrong(serial, expected):
             self.notice(Fault.WRONG_CHARGER, present=True)
             found = serial or "no serial number"
             message = f"found {found} at device-ID {address}, expected {expected}"

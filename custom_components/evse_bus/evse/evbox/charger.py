@@ -326,6 +326,8 @@ class EvboxCharger(Charger[EvboxConfig]):
             if found != self._other_serial:
                 self._other_serial = found
                 return
+            if self.is_wrong(found, None):
+                raise self._refuse(found, None)
             self._serial = found
         if same_serial(self._serial, found):
             self._other_serial = None
@@ -337,7 +339,11 @@ class EvboxCharger(Charger[EvboxConfig]):
             self._other_serial = found
             message = f"serial number {found} instead of {expected}"
             raise ImplausibleReplyError(message)
-        why = f"serial number {found} instead of {expected}"
+        raise self._refuse(found, expected)
+
+    def _refuse(self, found: str, expected: str | None) -> WrongChargerError:
+        """Send nothing more to another ChargePoint; return the error to raise."""
+        why = f"serial number {found} instead of {expected or 'one of its own'}"
         message = f"{self.config.name}: {why}"
         _LOGGER.warning("%s; nothing more is sent to it", message)
         self._wrong_charger = WrongChargerError(message, expected=expected, found=found)
@@ -345,7 +351,7 @@ class EvboxCharger(Charger[EvboxConfig]):
         self.set_unavailable(why)
         self._stop()
         self.updated()
-        raise self._wrong_charger
+        return self._wrong_charger
 
     def _on_implausible(self) -> None:
         """Count an implausible reply; too many in a row drop the reading."""

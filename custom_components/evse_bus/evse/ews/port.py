@@ -187,7 +187,7 @@ class BoxPort(Charger[EwsPortConfig]):
 
     def _check_identity(self) -> None:
         found, expected = self.box.serial, self.config.serial
-        is_wrong = expected is not None and found != expected
+        is_wrong = self.is_wrong(found, expected)
         self.notice(Fault.WRONG_CHARGER, present=is_wrong)
         if is_wrong and found is not None:
             self.set_unavailable("another box answers")
