@@ -11,7 +11,9 @@ from .chargers.managed import ManagedCharger
 from .configuration import protocol_of
 from .const import CONF_ENTRY, CONF_SERIAL, CONF_SUBENTRY, DOMAIN
 from .evse.bus import Bus
+from .evse.load import Overload
 from .evse.model import Fault, Orders
+from .evse.round_trip import RoundTrip
 from .evse.safety import INTERVALS_PER_TIMEOUT
 from .identity import Holder, another_box_texts, holder
 
@@ -22,6 +24,8 @@ TIMEOUT_RAISED: Final = "timeout_raised"
 ENERGY_NOT_COUNTED: Final = "energy_not_counted"
 SECOND_MASTER: Final = "second_master"
 MODBUS_TCP: Final = "modbus_tcp"
+REPLIES_TOO_LATE: Final = "replies_too_late"
+LINE_TOO_SLOW: Final = "line_too_slow"
 SET_UP_TWICE: Final = "set_up_twice"
 
 WRONG_CHARGER: Final = "wrong_charger"
@@ -65,6 +69,16 @@ def _create(
         translation_key=key,
         translation_placeholders=placeholders,
     )
+
+
+def speed_texts(trip: RoundTrip) -> dict[str, str]:
+    """Return the speed of a line as placeholders of texts."""
+    return {"round_trip": f"{trip.mean or 0:.1f}", "longest": f"{trip.longest:g}"}
+
+
+def load_texts(overload: Overload) -> dict[str, str]:
+    """Return a deadline that cannot be kept as placeholders of texts."""
+    return {"needed": f"{overload.needed:.0f}", "within": f"{overload.within:g}"}
 
 
 class BusIssues:
@@ -162,6 +176,20 @@ class BusIssues:
             self._entry.entry_id,
             present=bus.wire.gateway.detected,
             placeholders={"bus": self._entry.title, "port": bus.line.url},
+        )
+        shown = {"bus": self._entry.title} | speed_texts(bus.wire.round_trip)
+        self._set(
+            REPLIES_TOO_LATE,
+            self._entry.entry_id,
+            present=bus.too_slow,
+            placeholders=shown,
+        )
+        overload = bus.overload
+        self._set(
+            LINE_TOO_SLOW,
+            self._entry.entry_id,
+            present=overload is not None and not bus.too_slow,
+            placeholders=shown if overload is None else shown | load_texts(overload),
         )
 
     def check(self, managed: ManagedCharger) -> None:

@@ -1,7 +1,8 @@
 """Under every load a command is sent within a bound, and a deadline that can be kept is.
 
 The bound: a round of the deadlines for each command that waits before it. Where the
-command meets the deadline of its own charger, one round is enough for all.
+command meets the deadline of its own charger, one round is enough for all. Where
+deadlines are late already, it is a round of all chargers.
 """
 
 import asyncio
@@ -20,6 +21,7 @@ from custom_components.evse_bus.evse.errors import (
 )
 from custom_components.evse_bus.evse.exchange import Turn
 from custom_components.evse_bus.evse.framing import Timing
+from custom_components.evse_bus.evse.load import ENDS_AT, Recurring, find_overload
 from custom_components.evse_bus.evse.model import OrderChange, Orders
 from tests.evse.evbox.scene import EvboxLine, Scene as EvboxScene
 from tests.simulated_time import now, simulate
@@ -131,7 +133,9 @@ def test_a_command_is_sent_within_its_bound(load: Load) -> None:
                 tasks.append(asyncio.create_task(command(address)))
             longest = max(one.slot.worst_case for one in bus.chargers.values())
             await asyncio.gather(*tasks)
-            one_round = load.keep_alive + (load.keepers + 2) * longest
+            # Where deadlines are late already, the others have their turns as well.
+            turns = count_all(load) + len(asked) + 2
+            one_round = load.keep_alive + turns * longest
             for when, address in asked:
                 sent = next(at for at in line.times(address, "W") if at >= when)
                 waiting = sum(
@@ -236,3 +240,25 @@ def test_sixteen_evbox_behind_a_slow_adapter(
             assert [point.counters.fail_backs for point in points] == before
 
     simulate(scene())
+
+
+recurring = st.builds(
+    Recurring, takes=st.floats(0.01, 5.0), within=st.sampled_from([2.0, 15.0, 60.0])
+)
+
+
+@given(st.lists(recurring, max_size=20), st.floats(0.0, 10.0))
+def test_an_overload_is_a_deadline_that_a_round_exceeds(
+    turns: list[Recurring], lost: float
+) -> None:
+    overload = find_overload(turns, lost)
+    alike = {one.within for one in turns}
+    if len(alike) == 1:
+        [within] = alike
+        needed = lost + sum(one.takes for one in turns)
+        assert (overload is not None) == (needed > within)
+    if overload is not None:
+        assert overload.needed > overload.within
+        # More turns never make it fit; and it is over only with a margin.
+        assert find_overload([*turns, *turns], lost) is not None
+        assert find_overload(turns, lost, share=ENDS_AT) is not None

@@ -44,6 +44,11 @@ class Beat(BusMaster):
 
     @property
     @override
+    def period(self) -> float:
+        return PERIOD
+
+    @property
+    @override
     def refusal(self) -> NotAvailableError | None:
         return NotAvailableError("hush") if self.silent else None
 

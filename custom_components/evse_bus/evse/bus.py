@@ -26,6 +26,7 @@ from .framing import Frame, Framer, Timing
 from .jobs import Job, JobQueue
 from .line import Line
 from .listeners import Observable
+from .load import ENDS_AT, Overload, Recurring, find_overload
 from .master import BusMaster, ChargerGroup
 from .model import OrderChange, Persistence
 from .port import Port
@@ -81,6 +82,10 @@ class Bus(Observable):
         self._turn_of: Slot | None = None
         self._turn_over = asyncio.Event()
         self._last = Turns()
+        self.overload: Overload | None = None
+        """The deadline that cannot be kept at the speed of the line."""
+        self.too_slow = False
+        """Replies come later than they may be waited for."""
         self._failures = RateLimiter(FAILURES_LOGGED, FAILURES_WINDOW)
         if group is not None:
             group.bus = self
@@ -237,6 +242,33 @@ class Bus(Observable):
         """Choose the next turn anew: something has changed."""
         self._timer.wake()
 
+    def find_overload(self) -> Overload | None:
+        """Return the deadline that cannot be kept at the speed of the line.
+
+        Less than before is needed to call an overload over.
+        """
+        share = 1.0 if self.overload is None else ENDS_AT
+        turns = [
+            Recurring(charger.slot.usual or 0.0, charger.keep_alive)
+            for charger in self.chargers.values()
+            if charger.keep_alive is not None
+        ]
+        if self.master is not None:
+            turns.append(Recurring(self.master.slot.worst_case, self.master.period))
+        lost = [
+            charger.exchanges_per_turn * self.wire.lost_time(charger.longest_request)
+            for charger in self.chargers.values()
+        ]
+        return find_overload(turns, max(lost, default=0.0), share=share)
+
+    def _check_load(self) -> None:
+        """Call the listeners when deadlines can be kept no more, or again."""
+        overload, too_slow = self.find_overload(), self.wire.round_trip.too_slow
+        changed = (overload is None, too_slow) != (self.overload is None, self.too_slow)
+        self.overload, self.too_slow = overload, too_slow
+        if changed:
+            self.updated()
+
     def _set_times(self, charger: Charger) -> None:
         charger.slot.worst_case = self.worst_case(charger)
         usual = self.wire.usual_time(charger.longest_request)
@@ -250,6 +282,7 @@ class Bus(Observable):
             owner = self._charger_of(job)
             if owner is not None and job.change is not None:
                 job.worst_case = self.worst_case(owner)
+        self._check_load()
 
     def worst_case(self, charger: Charger) -> float:
         """Return the longest time one turn of a charger can take, s."""
@@ -392,6 +425,8 @@ class Bus(Observable):
             elif poll.result is not None:
                 self._follow_up(charger, poll.result, Persistence.STANDING)
             if charger.fingerprint != charger.last_fingerprint:
+                # Its time-out may have been raised.
+                self._check_load()
                 charger.updated()
 
     def _skip_poll(self, charger: Charger, error: LineError) -> None:

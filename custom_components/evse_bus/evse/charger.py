@@ -286,6 +286,14 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         """Return the number of exchanges that one turn may have at most."""
         return 1
 
+    @property
+    def keep_alive(self) -> float | None:
+        """Return the time within which it must be asked again, s; ``None``: no limit.
+
+        Otherwise it does what its fail-safe is.
+        """
+        return None
+
     def on_unsolicited(self, frame: Frame) -> FollowUp | None:  # noqa: ARG002
         """Return an urgent conversation for an unsolicited frame.
 

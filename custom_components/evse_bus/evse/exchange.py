@@ -23,6 +23,8 @@ from .recovery import LineRecovery
 from .round_trip import RoundTrip
 from .statistics import BusStatistics, ChargerStatistics, Direction, FrameLog
 
+_LATEST: Final = 10.0
+"""Time after which no reply to a request comes, on any line, s."""
 _BASE_REQUEST: Final = 64
 """Longest request of a conversation that belongs to no charger, bytes."""
 
@@ -86,6 +88,12 @@ class Wire:
             return None
         request = request_bytes * self.line.settings.byte_time
         return self.timing.silence + request + trip
+
+    def lost_time(self, request_bytes: int = _BASE_REQUEST) -> float:
+        """Return the time an exchange takes whose reply does not come, s."""
+        request = request_bytes * self.line.settings.byte_time
+        trip = self.round_trip
+        return self.timing.silence + request + trip.timeout + trip.drain
 
     def send_time(self, request_bytes: int) -> float:
         """Return the longest time that sending without a reply can take, s."""
@@ -213,7 +221,7 @@ class Wire:
         wait = last.timed_out_at + self.round_trip.drain - loop.time()
         if wait > 0:
             await asyncio.sleep(wait)
-        since = loop.time() - self.round_trip.longest
+        since = loop.time() - max(self.round_trip.longest, _LATEST)
         self._unanswered = [one for one in self._unanswered if one.sent_at >= since]
 
     def _late_request(self, frame: Frame | None) -> _Unanswered | None:

@@ -48,6 +48,11 @@ class BusMaster(ChargerGroup, Observable, ABC):
 
     @property
     @abstractmethod
+    def period(self) -> float:
+        """Return the time within which its turn must come again, s."""
+
+    @property
+    @abstractmethod
     def silent(self) -> bool:
         """Return whether nothing may be sent on this bus outside the master's turn."""
 

@@ -40,10 +40,15 @@ class RoundTrip:
 
     @property
     def usual(self) -> float | None:
-        """Return a round trip that few exceed, s; ``None``: no reply yet."""
-        if self._mean is None:
+        """Return a round trip that few exceed, s; ``None``: no usable reply yet."""
+        if self._mean is None or self.too_slow:
             return None
         return min(self._mean + _USUAL_DEVIATIONS * self._deviation, self.timeout)
+
+    @property
+    def too_slow(self) -> bool:
+        """Return whether replies come later than the line may be waited for."""
+        return self._mean is not None and self._mean > self._most
 
     @property
     def longest(self) -> float:

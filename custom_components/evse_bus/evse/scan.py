@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from .readings import ChargerInfo
+from .round_trip import RoundTrip
 
 type Address = int | str
 """Address of a charger on its bus; of a box that is alone there, its serial number."""
@@ -37,3 +38,5 @@ class ScanResult:
     """Another master is active on this line; nothing was sent."""
     gateway: bool = False
     """The adapter speaks Modbus TCP, and passes nothing on."""
+    round_trip: RoundTrip | None = None
+    """What the search has learnt of the line; ``None``: there was none."""

@@ -1,11 +1,22 @@
 """Trying a port and searching a bus, for the flows."""
 
-from collections.abc import Mapping, Sequence
+import asyncio
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from os.path import realpath
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import urlsplit
 
+from homeassistant.config_entries import ConfigSubentry, ConfigSubentryData
+
+from ..configuration import (
+    charger_configs,
+    initial_orders,
+    line_settings,
+    protocol_of,
+    supply_of,
+)
 from ..const import (
     CONF_FAIL_SAFE_CURRENT,
     CONF_FAIL_SAFE_TIMEOUT,
@@ -31,11 +42,17 @@ from .schema import CONF_SEARCH_CURRENT
 if TYPE_CHECKING:
     from ..evse.bus import Bus
     from ..evse.framing import LineSettings
+    from ..evse.load import Overload
+    from ..evse.memory import LineMemory
     from ..evse.protocol import Progress, Protocol
+    from ..evse.round_trip import RoundTrip
     from ..evse.scan import Address
 
 type Probe = tuple[ChargerConfig, Orders]
 """Configuration and orders that a search uses; sent where every message sets limits."""
+
+_LATE_REPLIES: Final = 5.0
+"""Wait for replies to a search without any, s: the line may be slow."""
 
 _ERRORS: Final[dict[type[Exception], str]] = {
     PortBusyError: "port_busy",
@@ -129,8 +146,29 @@ async def async_search(
 ) -> ScanResult:
     """Search a started bus with each probe in turn; return the results as one.
 
-    Raises LineError, and what `Protocol.scan` raises.
+    Where replies came late, the line is slow: the search is repeated with the reply
+    time-out learnt from them. Raises LineError, and what `Protocol.scan` raises.
     """
+    late = bus.wire.statistics.late
+    result = await _async_search_once(protocol, bus, searches, progress)
+    if not result.found:
+        await _async_wait_for_late_replies(bus, late)
+    if bus.wire.statistics.late > late and not bus.wire.round_trip.too_slow:
+        result = await _async_search_once(protocol, bus, searches, progress)
+    return result
+
+
+async def _async_wait_for_late_replies(bus: Bus, late: int) -> None:
+    loop = asyncio.get_running_loop()
+    until = loop.time() + _LATE_REPLIES
+    while bus.wire.statistics.late == late and loop.time() < until:  # noqa: ASYNC110
+        # The library counts them; it has no event for one of them.
+        await asyncio.sleep(0.1)
+
+
+async def _async_search_once(
+    protocol: Protocol, bus: Bus, searches: Sequence[Probe], progress: Progress
+) -> ScanResult:
     results: list[ScanResult] = []
     for config, orders in searches:
         share = partial(_share, progress, len(results), len(searches))
@@ -142,6 +180,43 @@ async def async_search(
         unsupported=tuple(one for result in results for one in result.unsupported),
         other_master=any(result.other_master for result in results),
         gateway=bus.wire.gateway.detected,
+        round_trip=bus.wire.round_trip,
+    )
+
+
+def overload_of(
+    data: Mapping[str, Any],
+    chargers: Iterable[ConfigSubentry | ConfigSubentryData],
+    round_trip: RoundTrip,
+    memory: LineMemory,
+) -> Overload | None:
+    """Return the deadline that these chargers together would miss on a line.
+
+    ``data``: of the config entry of the bus; ``memory``: of the line.
+    """
+    protocol = protocol_of(data)
+    bus = protocol.bus(
+        "", settings=line_settings(data), circuit=supply_of(data), memory=memory
+    )
+    bus.wire.round_trip = round_trip
+    for number, one in enumerate(chargers):
+        subentry = _as_subentry(number, one)
+        for config in charger_configs(data, subentry):
+            bus.add(protocol.charger(config, initial_orders(subentry, config)))
+    return bus.find_overload()
+
+
+def _as_subentry(
+    number: int, one: ConfigSubentry | ConfigSubentryData
+) -> ConfigSubentry:
+    if isinstance(one, ConfigSubentry):
+        return one
+    return ConfigSubentry(
+        data=MappingProxyType(one["data"]),
+        subentry_id=f"new_{number}",
+        subentry_type=one["subentry_type"],
+        title=one["title"],
+        unique_id=one["unique_id"],
     )
 
 

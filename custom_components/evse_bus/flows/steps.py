@@ -10,10 +10,11 @@ from homeassistant.const import CONF_ADDRESS, CONF_NAME
 from homeassistant.data_entry_flow import FlowContext, FlowResult
 
 from ..configuration import line_settings
-from ..connections import connection_name
+from ..connections import connection_name, line_memory
 from ..const import CONF_INSTALLATION_LIMIT, SUBENTRY_CHARGER
 from ..evse.scan import Address, ScanResult
 from ..identity import Holder, holder, identity_data
+from ..issues import load_texts, speed_texts
 from .address import Errors, manual_form, typed_addresses
 from .address_change import AddressSteps
 from .charger import (
@@ -34,7 +35,7 @@ from .schema import (
     found_options,
     model_name,
 )
-from .search import error_key
+from .search import error_key, overload_of
 from .supply import supply_texts
 
 if TYPE_CHECKING:
@@ -140,7 +141,7 @@ class ChargerSteps[
         return self.async_show_progress_done(next_step_id=self._step_after_scan())
 
     def _step_after_scan(self) -> str:
-        result = self._result
+        result, trip = self._result, self._result.round_trip
         steps = {
             "other_master": result.other_master,
             "modbus_tcp": result.gateway,
@@ -148,6 +149,7 @@ class ChargerSteps[
             "unsupported": result.unsupported,
             "select": self._new(),
             "nothing_new": result.found,
+            "replies_too_late": trip is not None and trip.too_slow,
             "unreadable": result.unreadable,
         }
         return next(
@@ -342,7 +344,7 @@ class ChargerSteps[
                 self._pending.pop(0)
                 user_input = None
                 if not self._pending:
-                    return await self._async_confirm()
+                    return await self.async_step_line_too_slow()
         candidate = self._pending[0]
         if (other := self.holder(candidate.serial(self.protocol))) is not None:
             return self.abort_held(other)
@@ -432,6 +434,40 @@ class ChargerSteps[
                 )
             )
         return errors
+
+    # -- Speed of the line -------------------------------------------------------
+
+    async def async_step_replies_too_late(
+        self,
+        user_input: dict[str, Any] | None = None,  # noqa: ARG002
+    ) -> ResultT:
+        """Report replies that come later than the protocol can wait for them."""
+        trip = self._result.round_trip
+        texts = {} if trip is None else speed_texts(trip)
+        return self._menu("replies_too_late", (), **texts)
+
+    async def async_step_line_too_slow(
+        self, user_input: dict[str, Any] | None = None
+    ) -> ResultT:
+        """Warn of deadlines that cannot be kept at the speed of the line."""
+        trip = self._result.round_trip
+        if user_input is not None or trip is None:
+            return await self._async_confirm()
+        overload = overload_of(
+            self.bus_data,
+            [*self.others(), *self.ready],
+            trip,
+            line_memory(self.hass, connection_name(self.bus_data)),
+        )
+        if overload is None:
+            return await self._async_confirm()
+        return self.async_show_form(
+            step_id="line_too_slow",
+            description_placeholders=self.placeholders()
+            | speed_texts(trip)
+            | load_texts(overload),
+            last_step=False,
+        )
 
     # -- Confirm -----------------------------------------------------------------
 

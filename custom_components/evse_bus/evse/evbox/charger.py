@@ -201,6 +201,11 @@ class EvboxCharger(Charger[EvboxConfig]):
 
     @property
     @override
+    def keep_alive(self) -> float:
+        return float(self.effective_timeout)
+
+    @property
+    @override
     def longest_request(self) -> int:
         """Return the length of a request, bytes."""
         return LONGEST_REQUEST[self.config.command]

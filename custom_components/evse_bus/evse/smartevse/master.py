@@ -462,6 +462,11 @@ class Master(BusMaster):
 
     @property
     @override
+    def period(self) -> float:
+        return PERIOD
+
+    @property
+    @override
     def silent(self) -> bool:
         return self._phase in (_Phase.LISTENING, _Phase.SILENCED)
 
