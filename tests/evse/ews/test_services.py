@@ -2,6 +2,7 @@
 
 import asyncio
 from contextlib import nullcontext
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from unittest.mock import patch
@@ -36,6 +37,7 @@ from tests.virtual.ews_parameters import SystemParameters as VirtualParameters
 from tests.virtual.ews_rfid import Card
 
 from .scene import EwsScene, play
+from .test_agreement import Damage
 
 
 def test_a_card_is_accepted() -> None:
@@ -208,6 +210,23 @@ def test_a_field_that_the_box_keeps_raises() -> None:
             await scene.charger().services.change_parameters(
                 SYSTEM_BLOCK, {"mode": mode}
             )
+
+    play(EwsScene(), acts)
+
+
+@pytest.mark.parametrize("field", range(0, 20, 3))
+def test_no_damaged_parameter_is_written_back(field: int) -> None:
+    """What was read is written: only if two replies are equal."""
+
+    async def acts(scene: EwsScene) -> None:
+        scene.box.system.admin_password = b"geheim".ljust(12, b"\0")
+        scene.box.system.card_pin = b"4711"
+        before = replace(scene.box.system)
+        damage = Damage(scene.line, "rp")
+        damage.flips = [{field: 1, 26: 1}]
+        await scene.charger().services.change_parameters(SYSTEM_BLOCK, {"ports": 2})
+        assert damage.damaged == 1
+        assert scene.box.system == replace(before, ports=2)
 
     play(EwsScene(), acts)
 
