@@ -10,13 +10,14 @@ import pytest
 
 from custom_components.evse_bus.evse import bus as bus_module
 from custom_components.evse_bus.evse.bus import FAILURES_LOGGED
-from custom_components.evse_bus.evse.conversation import rest
+from custom_components.evse_bus.evse.conversation import FollowUp, rest
 from custom_components.evse_bus.evse.errors import (
     LineLostError,
     NotAvailableError,
 )
 from custom_components.evse_bus.evse.exchange import Turn
 from custom_components.evse_bus.evse.model import OrderChange, Orders
+from custom_components.evse_bus.evse.readings import ChargerReading
 from custom_components.evse_bus.evse.safety import clamp
 from custom_components.evse_bus.evse.statistics import (
     KEPT_BYTES,
@@ -25,6 +26,7 @@ from custom_components.evse_bus.evse.statistics import (
     Direction,
     FrameLog,
 )
+from tests.evse.simulated_line import until
 from tests.simulated_time import now, simulate
 
 from .telegram import Scene, SimulatedCharger, TelegramLine
@@ -40,6 +42,29 @@ class SlowCharger(SimulatedCharger):
         await self.say(turn, "W", int(clamp(orders, self.limits).current))
         await rest(1.0)
         await self.say(turn, "V")
+
+
+class ThoroughCharger(SimulatedCharger):
+    """Reads in two turns, and writes when it has read both."""
+
+    @override
+    async def poll(self, turn: Turn) -> FollowUp | None:
+        await self.say(turn, "R")
+        await rest(0.2)
+        await self.say(turn, "S")
+        self.polls += 1
+        self.reading = ChargerReading()
+        return FollowUp(self.note) if self.polls == 1 else None
+
+    async def note(self, turn: Turn) -> None:
+        await self.say(turn, "N")
+
+
+def thorough(scene: Scene) -> ThoroughCharger:
+    plain = scene.make(1)
+    charger = ThoroughCharger(plain.config, plain.orders)
+    scene.bus.add(charger)
+    return charger
 
 
 def slow(scene: Scene) -> SlowCharger:
@@ -372,5 +397,46 @@ def test_a_command_that_never_fits_is_let_in_after_a_broadcast() -> None:
             start = now()
             await charger.change_orders(OrderChange(current=8.0))
             assert now() - start < 2 * PERIOD
+
+    simulate(scene())
+
+
+def test_a_poll_that_fails_after_its_first_turn_is_a_miss() -> None:
+    async def scene() -> None:
+        async with Scene(addresses=(1,), interval=1.0) as bus:
+            charger = thorough(bus)
+            await asyncio.sleep(5)
+            assert charger.available
+            # The follow-up of a later turn is held too.
+            assert len(bus.line.times(1, "N")) == 1
+            device = bus.line.devices[1]
+            device.answer = lambda request: None if request[2] == ord("S") else request
+            begin = now()
+            await until(lambda: charger.misses > 0)
+            # It is polled again soon, not at the next interval.
+            await until(lambda: charger.misses > 1)
+            assert now() - begin < 3.0
+            await until(lambda: not charger.available)
+            assert charger.reading is None
+            assert charger.statistics.timeouts >= charger.timing.misses
+            device.answer = None
+            await until(lambda: charger.available, 60)
+            assert charger.misses == 0
+
+    simulate(scene())
+
+
+def test_a_charger_has_answered_when_its_poll_has_ended() -> None:
+    async def scene() -> None:
+        bus = Scene(addresses=(1,), interval=1.0)
+        charger = thorough(bus)
+        shown: list[bool] = []
+        charger.subscribe(
+            lambda: shown.append(charger.available and charger.reading is None)
+        )
+        async with bus:
+            await until(lambda: charger.available)
+            assert charger.reading is not None
+            assert not any(shown)
 
     simulate(scene())

@@ -19,6 +19,7 @@ from .errors import (
     LineError,
     LineLostError,
     NotAvailableError,
+    NotConfirmedError,
     WrongChargerError,
 )
 from .exchange import Turn, Wire
@@ -365,9 +366,8 @@ class Bus(Observable):
             self.wire.statistics.missed_deadlines += 1
         if isinstance(slot, Job):
             await self._jobs.serve(slot, self.wire, connected=lambda: self.connected)
-            if charger is not None and isinstance(slot.outcome, FollowUp):
-                # Of a poll that has rested.
-                self._follow_up(charger, slot.outcome, Persistence.STANDING)
+            if charger is not None and slot.is_poll and slot.future.done():
+                self._poll_ended(charger, slot.outcome, is_planned=True)
         elif charger is not None:
             await self._poll_turn(charger)
         self._respect_minimum(charger)
@@ -399,31 +399,52 @@ class Bus(Observable):
         )
         try:
             pause = await poll.go_on()
-        except LineError as error:
-            self._skip_poll(charger, error)
-        except ImplausibleReplyError as error:
-            # It did answer; an implausible reply changes nothing.
-            _LOGGER.debug("%s: %s", charger.config.name, error)
-            charger.statistics.implausible += 1
-            charger.plan(self.now)
         except EvseError as error:
-            _LOGGER.debug("%s: %s", charger.config.name, error)
-            if isinstance(error, WrongChargerError):
-                charger.on_wrong_charger(error.found)
-            charger.on_missed(self.now, str(error))
+            self._poll_ended(charger, error)
         except Exception as error:
             # A mistake of ours must not end the bus for all other chargers.
             _LOGGER.exception("%s: a poll failed unexpectedly", charger.config.name)
             charger.on_missed(self.now, repr(error))
         else:
-            now = self.now
-            charger.on_reply(now)
-            charger.plan(now)
-            if pause is not None:
-                goes_on = FollowUp(charger.poll, pause.pause, pause.worst_case)
-                self._follow_up(charger, goes_on, Persistence.STANDING, poll)
-            elif poll.result is not None:
-                self._follow_up(charger, poll.result, Persistence.STANDING)
+            if pause is None:
+                self._poll_ended(charger, poll.result)
+                return
+            # It counts as answered or missed when it ends.
+            charger.plan(self.now)
+            goes_on = FollowUp(charger.poll, pause.pause, pause.worst_case)
+            self._follow_up(charger, goes_on, Persistence.STANDING, poll)
+            if charger.fingerprint != charger.last_fingerprint:
+                charger.updated()
+
+    def _poll_ended(
+        self, charger: Charger, outcome: object, *, is_planned: bool = False
+    ) -> None:
+        """Take note of the end of a poll: its result, or the error in any turn.
+
+        ``is_planned``: the next poll is planned since its first turn.
+        """
+        error = outcome
+        if isinstance(outcome, NotConfirmedError):
+            # In a later turn it stands for another one.
+            error = outcome.__cause__ or outcome
+        if isinstance(error, LineError):
+            self._skip_poll(charger, error)
+        elif isinstance(error, ImplausibleReplyError):
+            # It did answer; an implausible reply changes nothing.
+            _LOGGER.debug("%s: %s", charger.config.name, error)
+            charger.statistics.implausible += 1
+            charger.plan(self.now)
+        elif isinstance(error, Exception):
+            _LOGGER.debug("%s: %s", charger.config.name, error)
+            if isinstance(error, WrongChargerError):
+                charger.on_wrong_charger(error.found)
+            charger.on_missed(self.now, str(error))
+        else:
+            charger.on_reply(self.now)
+            if not is_planned:
+                charger.plan(self.now)
+            if isinstance(outcome, FollowUp):
+                self._follow_up(charger, outcome, Persistence.STANDING)
             if charger.fingerprint != charger.last_fingerprint:
                 # Its time-out may have been raised.
                 self._check_load()
@@ -445,7 +466,7 @@ class Bus(Observable):
         persistence: Persistence,
         running: RunningConversation[FollowUp | None] | None = None,
     ) -> None:
-        """Queue a conversation without a caller; ``running``: it has begun."""
+        """Queue a conversation without a caller; ``running``: the poll that goes on."""
         now = self.now
         self._jobs.add(
             Job(
@@ -456,6 +477,7 @@ class Bus(Observable):
                 worst_case=follow_up.worst_case or self.worst_case(charger),
                 conversation=follow_up.conversation,
                 running=running,
+                is_poll=running is not None,
                 persistence=persistence,
             )
         )

@@ -260,7 +260,8 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
     async def poll(self, turn: Turn) -> FollowUp | None:
         """Have the regular exchange; return a conversation that it leads to.
 
-        May rest, as any conversation: with its first turn the charger has answered.
+        May rest, as any conversation: the charger has answered when it ends, and has
+        missed a reply when it fails in any turn.
         """
 
     @abstractmethod

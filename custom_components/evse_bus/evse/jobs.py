@@ -49,6 +49,8 @@ class Job(Slot):
     """The order change it carries; merged jobs carry both."""
     raises: bool = False
     """It asked for more than stood at the time."""
+    is_poll: bool = False
+    """It is the rest of a poll that has rested."""
     begun: bool = False
     """Its first turn is over; the rest must be finished even when the bus stops."""
     under_way: bool = False
@@ -60,11 +62,11 @@ class Job(Slot):
 
     @property
     def outcome(self) -> object:
-        """Return the result of its conversation; ``None``: it has not ended well."""
+        """Return the result of its conversation, or its error, once it has ended."""
         future = self.future
-        if not future.done() or future.cancelled() or future.exception() is not None:
+        if not future.done() or future.cancelled():
             return None
-        return future.result()
+        return future.exception() or future.result()
 
 
 class JobQueue:

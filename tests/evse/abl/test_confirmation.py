@@ -203,6 +203,34 @@ async def test_a_limit_waits_for_c_where_a_pause_cannot_be_seen() -> None:
         await until(lambda: box.ic_amps == 6)
 
 
+async def test_a_later_silence_of_0x0f_is_a_miss_and_no_absence() -> None:
+    box = box_of_16_a(plugged())
+    async with Scene(box) as scene:
+        charger = await begun(scene, orders(10, allowed=True))
+        await until(lambda: box.state == "C2")
+        box.tells_icmax = False
+        await until(lambda: charger.box.icmax_misses == 1)
+        assert charger.box.missed
+        # Read again soon, with the identity first.
+        begin, serials = now(), len(scene.reads(1, 0x50))
+        await until(lambda: charger.box.icmax_misses == 2)
+        assert now() - begin < 2
+        assert len(scene.reads(1, 0x50)) > serials
+        # For however long: what the box does answer is shown, and in C Ic counts.
+        await asyncio.sleep(60)
+        reads = len(scene.reads(1))
+        await asyncio.sleep(60)
+        assert len(scene.reads(1)) - reads <= 61
+        assert charger.available
+        assert charger.reading is not None
+        assert charger.order_state is OrderState.NOT_READ_BACK
+        assert charger.box.reports_icmax
+        box.set_by_other_master(16)
+        await until(lambda: box.ic_amps < 11, 20)
+        box.tells_icmax = True
+        await until(lambda: charger.order_state is OrderState.CONFIRMED)
+
+
 # -- Who has paused it -----------------------------------------------------------------
 
 
@@ -265,6 +293,26 @@ async def test_allow_enables_an_outlet_disabled_by_a_long_pause() -> None:
         # The limit first.
         assert scene.writes()[before:] == [133, A1]
         await until(lambda: box.state == "C2")
+
+
+async def test_an_e0_after_a_missed_icmax_is_not_ours() -> None:
+    """It may have lost its power, and its pause, in between."""
+    box = box_of_16_a(plugged())
+    async with Scene(box) as scene:
+        charger = await begun(scene, orders(10, allowed=True))
+        charger._config = replace(charger.config, enable_again=True)
+        await charger.change_orders(OFF)
+        await asyncio.sleep(10)
+        box.tells_icmax = False
+        await until(lambda: charger.box.icmax_misses)
+        box.outlet.go("E0")
+        await asyncio.sleep(0.5)
+        box.tells_icmax = True
+        await asyncio.sleep(10)
+        assert charger.order_state is OrderState.CONFIRMED
+        with pytest.raises(NotAvailableError):
+            await charger.change_orders(ON)
+        assert box.state == "E0"
 
 
 async def test_without_the_option_the_outlet_stays_disabled() -> None:

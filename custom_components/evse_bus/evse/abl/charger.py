@@ -154,7 +154,9 @@ class AblCharger(AblWriter):
             self.notice(Fault.LIMIT_NOT_TAKEN, present=False)
         if decision.state is OrderState.CONFIRMED:
             self.box.note_confirmed(self.code)
-            self.box.missed = False
+            if not self.box.icmax_misses:
+                # Not by what was read before the miss.
+                self.box.missed = False
 
     # -- Orders ------------------------------------------------------------------
 

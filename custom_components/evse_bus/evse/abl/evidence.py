@@ -52,6 +52,8 @@ class BoxEvidence:
         """A reply was missed since the last limit was read back."""
         self.allowed_by_user = False
         """The user has allowed charging, and no reply was missed since."""
+        self.icmax_misses = 0
+        """Reads of 0x000F in a row that a box which has it did not answer."""
         self._icmax_at = -inf
         self._icmax_due = -inf
         self._icmax_silent = 0
@@ -92,7 +94,7 @@ class BoxEvidence:
         self.icmax = self.known_icmax = icmax
         self.reports_icmax = True
         self._icmax_at = now
-        self._icmax_silent = 0
+        self._icmax_silent = self.icmax_misses = 0
         if highest_current(icmax.default) is not None:
             self.default = icmax.default
 
@@ -112,6 +114,7 @@ class BoxEvidence:
         prove that it has no such register, and so does a refusal.
         """
         if self.reports_icmax:
+            self.icmax_misses += 1
             return
         self._icmax_silent = ICMAX_PROBES if refused else self._icmax_silent + 1
         if self._icmax_silent >= ICMAX_PROBES:

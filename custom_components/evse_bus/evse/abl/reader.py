@@ -185,6 +185,13 @@ class AblReader(Charger[AblConfig]):
             # It may be asleep, and has lost the first request or two.
             self.slot.ready = self.slot.due = now + self.timing.retry_pauses[0]
 
+    @override
+    def plan(self, now: float) -> None:
+        super().plan(now)
+        if 0 < self.box.icmax_misses < self.timing.misses:
+            # As after any missed reply. What it does answer is shown all the same.
+            self.slot.ready = self.slot.due = now + self.timing.retry_pauses[0]
+
     def _forget(self) -> None:
         """Drop what a power cut or another master may have changed unseen."""
         self.box.forget()
@@ -454,6 +461,10 @@ class AblReader(Charger[AblConfig]):
         except (ExchangeRefusedError, ReplyTimeoutError) as error:
             refused = isinstance(error, ExchangeRefusedError)
             box.on_icmax_silent(turn.now, refused=refused)
+            if box.icmax_misses:
+                # It has missed a request, though it has answered the one before.
+                self._forget()
+                self.require_identification()
             return
         box.keep_icmax(icmax, turn.now)
         if icmax.duty not in (0, PAUSE) and self.code != PAUSE:
@@ -465,7 +476,9 @@ class AblReader(Charger[AblConfig]):
     async def _read_icmax(self, turn: Turn) -> Icmax:
         """Read 0x000F; what is neither known nor just written is read twice."""
         known, written = self.box.known_icmax, self.box.writes.code
-        icmax = await read(turn, self.config.address, ICMAX)
+        # Where it is known to be there, a lost reply was disturbed.
+        attempts = 2 if self.box.reports_icmax else 1
+        icmax = await read(turn, self.config.address, ICMAX, attempts=attempts)
         self.box.reports_icmax = True
         if known and written is not None and icmax == replace(known, duty=written):
             return icmax
