@@ -19,6 +19,7 @@ and below 52.5 A has no code of its own and becomes 51 A.
 """
 
 from decimal import ROUND_FLOOR, Decimal
+from functools import lru_cache
 from typing import Final
 
 from ..errors import RefusedOrderError
@@ -34,6 +35,7 @@ _TOLERATED_END: Final = 970
 _UPPER_BEGIN: Final = Decimal("52.5")
 
 
+@lru_cache
 def duty_for(current: float) -> int:
     """Return the duty cycle (0.1 %) that offers at most this current (A).
 
@@ -64,6 +66,7 @@ def current_for(duty: int) -> float | None:
     return min(float((Decimal(duty) / 10 - 64) * Decimal("2.5")), MAXIMUM_CURRENT)
 
 
+@lru_cache
 def highest_current(duty: int) -> float | None:
     """Return the highest current (A, in 0.1 A) whose duty cycle is at most this one.
 
