@@ -502,6 +502,30 @@ async def test_a_second_box_switched_on_in_the_middle_gets_no_write(value: int) 
         assert two.writes == []
 
 
+@pytest.mark.parametrize("later", [0.0, 0.01, 0.1])
+@pytest.mark.parametrize("reads_in_e2", [True, False])
+async def test_a_second_box_that_comes_right_before_e2_is_noticed_by_its_reply(
+    later: float,
+    reads_in_e2: bool,  # noqa: FBT001
+) -> None:
+    """It was not there when all replies were awaited; then it may answer no reads."""
+    one = box(jitter=0.0)
+    two = box(serial=SECOND, turn_round=0.002 + later, jitter=0.0, boot_time=0.05)
+    two.on, two.reads_in_e2 = False, reads_in_e2
+    async with Scene(one, two) as scene:
+        changing = asyncio.create_task(problem(scene))
+        await until(lambda: len(scene.reads(1, READING)) == 4, LONG)
+        await until(lambda: scene.requests()[-1].register == SERIAL, LONG)
+        await asyncio.sleep(0.1)
+        two.switch_on()
+        assert await changing is Problem.SECOND_CHARGER
+        assert E2 in written(two)
+        assert not {0xF002, RESET} & {*written(one), *written(two)}
+        two.switch_off()
+        assert await change(scene, serial=FIRST) == AddressChanged(serial=FIRST)
+        assert two.device_id == 1
+
+
 async def test_a_box_that_answers_at_both() -> None:
     one, ghost = box(), box()
     ghost.on = False

@@ -9,7 +9,7 @@ was sent only a reset follows: no device-ID is left that a power cut would bring
 """
 
 import asyncio
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import Enum, IntEnum
@@ -40,7 +40,7 @@ from ..protocol import Progress
 from ..schedule import Kind
 from .charger import AblCharger
 from .config import Pauses
-from .exchanges import collect, write_once
+from .exchanges import collect, collect_confirmations
 from .reader import read
 from .registers import (
     ADDRESSES,
@@ -112,6 +112,18 @@ class _Answer(Enum):
     UNREADABLE = "unreadable"
     """Perhaps several boxes at once."""
     SILENT = "silent"
+
+
+class _Outcome(Enum):
+    """What was replied to a write."""
+
+    CONFIRMED = "confirmed"
+    REFUSED = "refused"
+    SEVERAL = "several replies"
+    """It has reached another box, too."""
+    UNREADABLE = "an unreadable reply"
+    """Perhaps of several boxes at once."""
+    UNANSWERED = "no reply"
 
 
 @dataclass(frozen=True, slots=True)
@@ -365,29 +377,35 @@ class DeviceIdChange:
             await self._check_state(turn)
             await self._rest(turn, self._pauses.verify)
         self._require_caller()
-        why = "no reply"
-        for _ in range(WRITES):
-            await self._check_state(turn)
-            await self._require_ours(turn)
+        state: int | None = None
+        outcome = _Outcome.UNANSWERED
+        for attempt in range(WRITES):
+            if attempt == 0 or state not in (E2, None):
+                await self._check_state(turn)
+            if attempt == 0:
+                await self._require_ours(turn)
+            else:
+                await self._require_alone(turn, self.change.old)
             self._begin(_Stage.SET_UP)
-            confirmed = False
-            try:
-                confirmed = await self._write_state(turn, self.change.old, StateCode.E2)
-            except ExchangeRefusedError as error:
-                # The reply to an earlier one may have been lost.
-                why = str(error)
+            outcome = await self._write_state(turn, self.change.old, StateCode.E2)
             await self._rest(turn, self._pauses.settings)
-            status = await self._read_state(turn, self.change.old)
-            if status is None:
-                if not confirmed:
-                    await self._leave_set_up(turn)
-                    break
-                # It does not answer reads there.
-                return
-            if status.state == E2:
+            state = await self._state_code(turn, self.change.old)
+            if outcome is _Outcome.SEVERAL:
+                break
+            if outcome is _Outcome.UNREADABLE:
+                # Once more: a box refuses it in E2, and two of them do so together.
+                continue
+            if state is None and outcome is not _Outcome.CONFIRMED:
+                await self._leave_set_up(turn)
+                break
+            if state in (E2, None):
+                # If not readable, it does not answer reads there.
                 return
         self._end_cleanup()
-        raise self._failed(Problem.REFUSED, f"it does not change to E2: {why}")
+        message = f"it does not change to E2: {outcome.value}"
+        several = outcome in (_Outcome.SEVERAL, _Outcome.UNREADABLE)
+        problem = Problem.SECOND_CHARGER if several else Problem.REFUSED
+        raise self._failed(problem, message)
 
     async def _write_id(self, turn: Turn) -> None:
         """Write the device-ID until it is confirmed, or until the box has it."""
@@ -398,17 +416,18 @@ class DeviceIdChange:
                 return
             await self._require_alone(turn, old)
             self._begin(_Stage.WRITTEN)
-            confirmed = False
-            try:
-                confirmed = await write_once(turn, request, self._id_confirmed)
-            except ExchangeRefusedError as error:
-                if attempt == 0:
-                    # It has no new device-ID, so a reset is not needed.
-                    self._begin(_Stage.SET_UP)
-                    await self._leave_set_up(turn)
-                    raise self._failed(Problem.REFUSED, str(error)) from error
+            outcome = await self._write(turn, request, self._id_confirmed)
+            if outcome is _Outcome.REFUSED and attempt == 0:
+                # It has no new device-ID, so a reset is not needed.
+                self._begin(_Stage.SET_UP)
+                await self._leave_set_up(turn)
+                raise self._failed(Problem.REFUSED, "it refuses the device-ID")
+            if outcome is _Outcome.SEVERAL:
+                self._end_cleanup()
+                message = "another box has taken the device-ID, too"
+                raise self._failed(Problem.SECOND_CHARGER, message)
             await self._rest(turn, self._pauses.settings)
-            if confirmed:
+            if outcome is _Outcome.CONFIRMED:
                 return
 
     def _id_confirmed(self, frame: ModbusFrame) -> bool | None:
@@ -424,8 +443,7 @@ class DeviceIdChange:
         code = StateCode.E0 if self._was_disabled else StateCode.A1
         for _ in range(WRITES):
             await self._require_alone(turn, old)
-            with suppress(ExchangeRefusedError):
-                await self._write_state(turn, old, code)
+            await self._write_state(turn, old, code)
             await self._rest(turn, self._pauses.settings)
             status = await self._read_state(turn, old)
             if status is not None and status.state != E2:
@@ -501,7 +519,7 @@ class DeviceIdChange:
         return None if status is None else status.state
 
     async def _reset(self, turn: Turn, address: int) -> None:
-        with suppress(AddressChangeError, ExchangeRefusedError):
+        with suppress(AddressChangeError):
             await self._require_alone(turn, address)
             await self._write_state(turn, address, StateCode.RESET)
 
@@ -510,9 +528,9 @@ class DeviceIdChange:
         for address in (self.change.old, self.change.new):
             if await self._who(turn, address) is not _Answer.SILENT:
                 return
-            with suppress(ExchangeRefusedError):
-                if await self._write_state(turn, address, StateCode.RESET):
-                    return
+            outcome = await self._write_state(turn, address, StateCode.RESET)
+            if outcome is _Outcome.CONFIRMED:
+                return
 
     async def _finish(self, turn: Turn) -> AddressChanged:
         """Bring back what the reset has ended; look for another box at the old ID."""
@@ -547,8 +565,7 @@ class DeviceIdChange:
         for _ in range(WRITES):
             if await self._who(turn, self.change.new) is not _Answer.OURS:
                 break
-            with suppress(ExchangeRefusedError):
-                await self._write_state(turn, self.change.new, StateCode.E0)
+            await self._write_state(turn, self.change.new, StateCode.E0)
             await self._rest(turn, self._pauses.settings)
             if await self._state_code(turn, self.change.new) == E0:
                 return True
@@ -631,9 +648,24 @@ class DeviceIdChange:
                     return replies[0]
         return None
 
-    async def _write_state(self, turn: Turn, address: int, code: StateCode) -> bool:
+    async def _write_state(self, turn: Turn, address: int, code: StateCode) -> _Outcome:
         answer = write_answer(address, STATE_REGISTER)
-        return await write_once(turn, write_state(address, code), answer)
+        return await self._write(turn, write_state(address, code), answer)
+
+    @staticmethod
+    async def _write(
+        turn: Turn, request: bytes, accept: Callable[[ModbusFrame], bool | None]
+    ) -> _Outcome:
+        """Send a write, and wait for every reply."""
+        try:
+            replies = await collect_confirmations(turn, request, accept)
+        except GarbledReplyError:
+            return _Outcome.UNREADABLE
+        except ReplyTimeoutError:
+            return _Outcome.UNANSWERED
+        if len(replies) > 1:
+            return _Outcome.SEVERAL
+        return _Outcome.CONFIRMED if replies == [None] else _Outcome.REFUSED
 
     def _failed(
         self, problem: Problem, message: str, status: Reading | None = None

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from ..errors import GarbledReplyError, ReplyTimeoutError
+from ..errors import ExchangeRefusedError, GarbledReplyError, ReplyTimeoutError
 from ..exchange import Turn
 from ..modbus import ModbusFrame
 from ..registers import Registers
@@ -54,3 +54,32 @@ async def write_once(
     finally:
         is_over = True
     return True
+
+
+async def collect_confirmations(
+    turn: Turn, request: bytes, accept: Callable[[ModbusFrame], bool | None]
+) -> list[ExchangeRefusedError | None]:
+    """Send a write; return all replies in time: ``None`` confirms it.
+
+    Two replies mean that it has reached two boxes. Raises ReplyTimeoutError where
+    there is no reply, and GarbledReplyError for unreadable bytes, which may be two.
+    """
+    replies: list[ExchangeRefusedError | None] = []
+    is_over = False
+
+    def accept_all(frame: ModbusFrame) -> bool | None:
+        if is_over:
+            return None
+        try:
+            if accept(frame) is None:
+                return None
+            replies.append(None)
+        except ExchangeRefusedError as error:
+            replies.append(error)
+        return True
+
+    try:
+        await turn.collect(request, accept_all)
+    finally:
+        is_over = True
+    return replies
