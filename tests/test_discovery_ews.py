@@ -2,7 +2,11 @@
 
 from typing import TYPE_CHECKING
 
-from homeassistant.config_entries import ConfigEntryState, ConfigSubentry
+from homeassistant.config_entries import (
+    ConfigEntryDisabler,
+    ConfigEntryState,
+    ConfigSubentry,
+)
 from homeassistant.const import EVENT_HOMEASSISTANT_STARTED
 from homeassistant.core import CoreState
 from homeassistant.data_entry_flow import FlowResultType, UnknownFlow
@@ -147,6 +151,9 @@ async def test_box_that_is_set_up_on_a_serial_line_is_not_offered(
 ) -> None:
     serial = bus_entry("ews", "/dev/serial/by-id/usb-none", stored_box(SERIAL))
     serial.add_to_hass(hass)
+    # Disabled: its port would be tried again all the time.
+    user = ConfigEntryDisabler.USER
+    await hass.config_entries.async_set_disabled_by(serial.entry_id, user)
     async with listening(hass) as entry:
         with dialling(entry) as dialler:
             await dialler.wait_for_async(lambda: listener_of(entry).unknown_boxes)
