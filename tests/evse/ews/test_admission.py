@@ -9,7 +9,6 @@ from custom_components.evse_bus.evse.ews.network.admission import (
     ALL_BYTES,
     BOX_BYTES,
     GRACE,
-    KEPT_PLACES,
     MOST_ADDRESSES,
     MOST_BYTES,
     PLACES,
@@ -40,7 +39,7 @@ def fill(made: Admission[int], address: IPv4Address, count: int, now: float) -> 
 
 def test_one_address_gives_way_to_another_at_once() -> None:
     made = admission()
-    assert fill(made, ONE, 100, 0.0) == PLACES
+    assert fill(made, ONE, 200, 0.0) == PLACES
     admitted, leaves = made.enter(-1, OTHER, 0.5)
     assert admitted
     assert leaves is not None
@@ -76,7 +75,7 @@ def test_strangers_take_no_place_kept_for_a_box() -> None:
 
 def test_a_box_that_shares_its_address_with_a_crowd_finds_a_place() -> None:
     made = admission(1, BOX)
-    assert fill(made, BOX, 200, 0.0) == KEPT_PLACES + 1
+    assert fill(made, BOX, 200, 0.0) == PLACES + 1
     # The other addresses are not crowded.
     assert made.enter(-1, OTHER, 0.2) == (True, None)
     assert made.enter(-2, BOX, GRACE)[0]
@@ -90,7 +89,7 @@ def test_addresses_of_one_ipv6_network_are_one() -> None:
 
 
 def test_each_box_has_a_place_more() -> None:
-    assert fill(admission(50), ONE, 100, 0.0) == PLACES + 50
+    assert fill(admission(50), ONE, 200, 0.0) == PLACES + 50
 
 
 def test_the_bytes_of_one_connection_are_limited() -> None:

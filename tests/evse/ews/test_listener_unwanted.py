@@ -145,6 +145,7 @@ def test_silent_connections_do_not_keep_boxes_out(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(admission, "GRACE", 0.1)
+    monkeypatch.setattr(admission, "PLACES", 16)
 
     async def scene() -> None:
         async with server() as made, expected(made) as bus:

@@ -13,12 +13,11 @@ from typing import Final
 
 from ...dialling import Address
 
-PLACES: Final = 16
+PLACES: Final = 128
 """Unidentified connections at once, beside one for each registered box: after a power
-failure all of them dial in the same moment."""
-KEPT_PLACES: Final = 128
-"""The same from addresses of registered boxes, which other devices may share with them:
-behind a router that translates addresses."""
+failure all of them dial in the same moment. So many again are kept for the addresses of
+registered boxes, which other devices may share with them: behind a router that
+translates addresses. A crowd of 100 a second is never more, with `GRACE`."""
 GRACE: Final = 1.0
 """An unidentified connection that is older may be dropped for a newer one, s."""
 
@@ -133,8 +132,7 @@ class Admission[V: Hashable]:
         group = group_of(address)
         is_kept = group in self._known
         room = self._kept if is_kept else self._strangers
-        places = (KEPT_PLACES if is_kept else PLACES) + self._boxes()
-        admitted, leaves = room.place_for(group, places, now)
+        admitted, leaves = room.place_for(group, PLACES + self._boxes(), now)
         if leaves is not None:
             del room.visits[leaves]
         if admitted:

@@ -45,6 +45,10 @@ _LOGGER = logging.getLogger(__name__)
 
 IDENTIFY_TIME: Final = 10.0
 """Longest time for a connection to be identified, s."""
+ACCEPTED_AT_ONCE: Final = 8
+"""Connections accepted in one round of the event loop, and one more."""
+QUEUE: Final = 128
+"""Connections that the system keeps until they are accepted."""
 MOST_UNKNOWN: Final = 8
 """Most connections of unknown boxes at once."""
 UNKNOWN_TIME: Final = 40.0
@@ -140,7 +144,12 @@ class Listener:
                 ),
                 self.host,
                 self.port,
+                backlog=ACCEPTED_AT_ONCE,
             )
+            for one in self._server.sockets:
+                # asyncio takes one number for both.
+                with one.dup() as same:
+                    same.listen(QUEUE)
         except (OSError, OverflowError, ValueError) as error:
             raise _error(error) from error
         self.port = self._server.sockets[0].getsockname()[1]
