@@ -201,7 +201,7 @@ def test_an_invalid_host(monkeypatch: pytest.MonkeyPatch) -> None:
     async def scene() -> None:
         loop = asyncio.get_running_loop()
 
-        async def fails(*_: object) -> None:
+        async def fails(*_: object, **_options: object) -> None:
             (300 * "a").encode("idna")
 
         monkeypatch.setattr(loop, "create_server", fails)
