@@ -86,8 +86,8 @@ async def test_a_clock_is_set_again_after_a_power_cut(
     box = EwsBox()
     async with running(hass, box) as (_, bus):
         await bus.wait_for_async(lambda: box.commands_named("sc"))
-        # Its flag of the last start must have been seen to be gone.
-        await bus.wait_for_async(lambda: len(box.commands_named("rs")) > 2)
+        # Its flag of the last start must have been seen to be gone, by two replies.
+        await bus.wait_for_async(lambda: len(box.commands_named("rs")) > 6)
         box.power_cycle(0.5)
         await bus.wait_for_async(lambda: len(box.commands_named("sc")) == 2, timeout=20)
         assert off(box) < timedelta(seconds=2)

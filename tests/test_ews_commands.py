@@ -233,7 +233,7 @@ async def test_a_power_cut_in_the_middle_of_a_charge(hass: HomeAssistant) -> Non
     async with running(hass, box, fail_safe_current=8.0) as (entry, bus):
         await charge(hass, entry, bus, box)
         status = await get_entity(hass, "sensor", entry, "1_status")
-        box.power_cycle(3.0)
+        box.power_cycle(6.0)
         await wait_for_state(hass, status, "unavailable")
         await bus.wait_for_async(lambda: port.contactor, timeout=20)
         await bus.wait_for_async(lambda: port.limit == 8, timeout=20)
