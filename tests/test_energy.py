@@ -240,6 +240,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("grown", "shown", "count"), [(1000, 11.0, 0), (90_000, 10.0, 1), (-1, 10.0, 1)]
 )
+@pytest.mark.parametrize("is_entry_removed", [False, True])
 @pytest.mark.usefixtures("impatient")
 async def test_a_meter_after_a_restart(
     hass: HomeAssistant,
@@ -247,6 +248,8 @@ async def test_a_meter_after_a_restart(
     grown: int,
     shown: float,
     count: int,
+    *,
+    is_entry_removed: bool,
 ) -> None:
     """In 5 minutes, one kWh may have flowed; what may not is reported."""
     box = EvboxChargePoint(1923054, [Module(energy_wh=6000)], min_interval=0)
@@ -265,6 +268,23 @@ async def test_a_meter_after_a_restart(
         for text in not_counted(hass):
             assert f"changed by {grown / 1000:+g} kWh" in text
             assert "the meter of Charger 1923054" in text
+        # It is found once only, so neither a reload nor a restart takes it away.
+        await hass.config_entries.async_reload(entry.entry_id)
+        await hass.async_block_till_done()
+        assert len(not_counted(hass)) == count
+        assert all(
+            issue.is_persistent
+            for issue in ir.async_get(hass).issues.values()
+            if issue.translation_key == "energy_not_counted"
+        )
+        # But the removal of its charger does.
+        if is_entry_removed:
+            await hass.config_entries.async_remove(entry.entry_id)
+        else:
+            (subentry_id,) = entry.subentries
+            hass.config_entries.async_remove_subentry(entry, subentry_id)
+        await hass.async_block_till_done()
+        assert not_counted(hass) == []
 
 
 def not_counted(hass: HomeAssistant) -> list[str]:

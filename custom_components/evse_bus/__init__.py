@@ -30,7 +30,7 @@ from .energy import TOTALS, TotalStore
 from .errors import not_ready
 from .evse.errors import LineError
 from .identity import identity_of, stands_on_serial
-from .issues import report_orders_written
+from .issues import forget_energy, report_orders_written
 from .services import async_register
 from .stores.addresses import ADDRESSES, AddressStore
 from .stores.orders import ORDERS, OrderStore, bus_key, subentry_keys
@@ -115,6 +115,7 @@ async def async_remove_entry(hass: HomeAssistant, entry: EvseBusConfigEntry) -> 
     protocol = protocol_of(entry.data)
     for subentry in entry.subentries.values():
         identity = identity_of(subentry)
+        forget_energy(hass, subentry.subentry_id)
         keys += subentry_keys(identity, protocol.ports)
         if not stands_on_serial(protocol, subentry):
             await hass.data[TOTALS].async_forget(identity)

@@ -52,6 +52,18 @@ def report_orders_written(hass: HomeAssistant, error: Exception | None) -> None:
         _create(hass, NOT_STORED, NOT_STORED, {"error": str(error)})
 
 
+def forget_energy(hass: HomeAssistant, key: str) -> None:
+    """Delete the issues about energy of a charger, also those of an earlier run.
+
+    ``key``: of the charger, or the id of its subentry.
+    """
+    for domain, issue in tuple(ir.async_get(hass).issues):
+        prefix, _, rest = issue.partition(f"{ENERGY_NOT_COUNTED}_")
+        owner = rest.partition("_")[2]
+        if domain == DOMAIN and not prefix and f"{owner}_".startswith(f"{key}_"):
+            ir.async_delete_issue(hass, DOMAIN, issue)
+
+
 def _create(
     hass: HomeAssistant,
     issue: str,
@@ -65,6 +77,8 @@ def _create(
         issue,
         data=fix,
         is_fixable=fix is not None,
+        # Found once only: it stays until the user ignores it.
+        is_persistent=key == ENERGY_NOT_COUNTED,
         severity=ir.IssueSeverity.ERROR,
         translation_key=key,
         translation_placeholders=placeholders,
@@ -299,11 +313,13 @@ class BusIssues:
         """Delete the issues of a charger."""
         for issue in [one for one in self._open if one.endswith(managed.key)]:
             self._delete(issue)
+        forget_energy(self._hass, managed.key)
 
     def clear(self) -> None:
-        """Delete all issues of this entry."""
+        """Delete the issues of this entry that would be found again."""
         for issue in tuple(self._open):
-            self._delete(issue)
+            if not issue.startswith(ENERGY_NOT_COUNTED):
+                self._delete(issue)
 
     def _set(
         self,
