@@ -49,7 +49,7 @@ async def test_devices_hang_together(hass: HomeAssistant) -> None:
 async def test_what_a_charger_was_stays_known_while_it_is_off(
     hass: HomeAssistant,
 ) -> None:
-    box = SmartEvse("2.20")
+    box = SmartEvse("2.20", unit=1)
     async with running(hass, box) as (entry, bus):
 
         def shown() -> tuple[str | None, ...]:

@@ -28,6 +28,7 @@ from custom_components.evse_bus.evse.ews.wire.answers import Refusal
 from custom_components.evse_bus.evse.ews.wire.cards import ENTRIES, LARGEST
 from custom_components.evse_bus.evse.ews.wire.commands import PortLeds, set_leds
 from tests.flow import english, has_range
+from tests.reasons import reason_keys
 
 from .services import WRITERS
 
@@ -189,8 +190,10 @@ def test_every_refusal_has_a_text() -> None:
     keys = {f"ews_{reason}" for reason in Refusal}
     for key in keys:
         assert "{charger}" in texts[key]["message"], key
+    states = {key for key in reason_keys() if key.startswith("ews_")}
     assert {key for key in texts if key.startswith("ews_")} == {
         *keys,
+        *states,
         "ews_secret_hidden",
     }
     assert set(ActionError) <= texts.keys()

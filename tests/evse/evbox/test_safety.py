@@ -161,7 +161,9 @@ class Trial:
 
     async def do_unplug(self, _value: float) -> None:
         if self.scene.line.is_open:
-            self.answered = 0
+            # Opened again at once, a box that was answering is still the same.
+            if self.charger.misses or not self.charger.available:
+                self.answered = 0
             self.scene.line.unplug()
 
     async def do_power_cycle(self, _value: float) -> None:
