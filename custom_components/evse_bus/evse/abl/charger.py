@@ -256,11 +256,12 @@ class AblCharger(AblWriter):
         ends_pause = (
             changes_limit and self.paused_by_our_limit and orders.allowed is not False
         )
+        after_pause = self.setpoint.paused
         return replace(
             self.box.standing(code, now),
             raised=changes_limit or self._fell_back,
             ends_pause=ends_pause,
-            after_pause=self.setpoint.paused,
+            after_pause=after_pause,
         )
 
     async def _reassert(self, turn: Turn) -> None:
