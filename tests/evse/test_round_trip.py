@@ -93,6 +93,56 @@ def test_a_late_reply_is_never_taken_for_a_newer_one(each_way: float) -> None:
     simulate(scene())
 
 
+@pytest.mark.parametrize("each_way", [0.2, 0.43, 0.45])
+def test_the_first_replies_of_a_slow_line_are_those_to_their_requests(
+    each_way: float,
+) -> None:
+    """Nothing is known of the line yet: the first reply may be a late one."""
+
+    async def scene() -> None:
+        bus = behind(each_way, (1,))
+        device = bus.line.devices[1]
+        device.answer = lambda request: bytes(
+            (ord("@"), 1, request[2], len(bus.line.sent))
+        )
+        seen: list[tuple[float, int]] = []
+
+        def look() -> None:
+            reading = bus.charger(1).reading
+            if reading is not None:
+                seen.append((len(bus.line.sent), int(reading.offered_current or 0)))
+
+        bus.charger(1).subscribe(look)
+        async with bus:
+            await asyncio.sleep(20)
+        # Each reading has the number of the last request.
+        assert seen
+        assert all(number == reported for number, reported in seen)
+
+    simulate(scene())
+
+
+def test_a_request_that_was_lost_costs_one_wait() -> None:
+    """A sleeping box loses the first request; the reply is that to the second one."""
+
+    async def scene() -> None:
+        bus = Scene(addresses=(1,), interval=1.0)
+        device = bus.line.devices[1]
+        device.alive = False
+        async with bus:
+            await asyncio.sleep(TIMING.reply_timeout * 1.1)
+            device.alive = True
+            begin = now()
+            await bus.charger(1).wait_available()
+            # If the reply was late, another one would come as late.
+            assert now() - begin < 2.5 * (TIMING.retry_pauses[0] + TIMING.reply_timeout)
+            assert bus.bus.wire.round_trip.mean is not None
+            assert bus.bus.wire.round_trip.mean < 0.1
+            assert bus.bus.wire.statistics.late == 0
+
+    simulate(scene())
+
+
 def test_an_adapter_that_becomes_slow_is_followed() -> None:
     async def scene() -> None:
         bus = behind(0.005, (1,))

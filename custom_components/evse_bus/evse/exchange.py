@@ -25,6 +25,8 @@ from .statistics import BusStatistics, ChargerStatistics, Direction, FrameLog
 
 _LATEST: Final = 10.0
 """Time after which no reply to a request comes, on any line, s."""
+_LATER: Final = 1.25
+"""Of two round trips of one line, the later one may take so much longer."""
 _BASE_REQUEST: Final = 64
 """Longest request of a conversation that belongs to no charger, bytes."""
 
@@ -143,7 +145,9 @@ class Wire:
         self.statistics.requests += 1
         counted.requests += 1
         try:
-            result = await pending.future
+            await pending.future
+            pending = await self._last_reply(pending, accept, sent)
+            result = pending.future.result()
         except ReplyTimeoutError as error:
             self.statistics.timeouts += 1
             counted.timeouts += 1
@@ -174,6 +178,45 @@ class Wire:
             if self._is_disturbed(bad, noise, counted):
                 raise GarbledReplyError("unreadable bytes came beside a reply")
         return result  # type: ignore[return-value] # accept's own type
+
+    async def _last_reply(
+        self,
+        pending: _PendingReply,
+        accept: Callable[..., object | None],
+        sent: float,
+    ) -> _PendingReply:
+        """Return the reply to a request sent then; ``pending``: the first that came.
+
+        On a line of which nothing is known, that may be the late reply to an earlier
+        request. The one to this request takes as long, so another one must follow.
+        """
+        if isinstance(accept, AllReplies):
+            return pending
+        while (
+            self.round_trip.mean is None
+            and pending.answered_at is not None
+            and (earlier := self._late_request(pending.frame)) is not None
+        ):
+            wait = _LATER * (pending.answered_at - earlier.sent_at)
+            newer = _PendingReply(
+                accept,
+                first_byte_by=sent + min(wait, self.round_trip.longest),
+                longest=self.timing.longest_reply * self.line.settings.byte_time,
+                gap=self.timing.gap,
+            )
+            self._pending = newer
+            self._unanswered.remove(earlier)
+            try:
+                await newer.future
+            except ReplyTimeoutError:
+                # The earlier request was lost: a box was asleep.
+                break
+            finally:
+                newer.close()
+            self.statistics.late += 1
+            pending.close()
+            pending = newer
+        return pending
 
     def _is_disturbed(self, bad: int, noise: int, counted: ChargerStatistics) -> bool:
         """Return whether unreadable bytes came since these counts, and count them."""

@@ -12,7 +12,7 @@ from tests.virtual import AblBox, Car
 
 from .scene import Scene, config, orders, until
 
-FOUND_WITHIN = 1.5
+FOUND_WITHIN = 2.0
 """From the first request to a sleeping box to its first reading, s."""
 PAIR_WITHIN = 1.0
 """From the first to the second request, s."""
