@@ -13,7 +13,14 @@ from homeassistant.data_entry_flow import FlowResultType
 import pytest
 
 from custom_components.evse_bus.evse.smartevse.polled import QUIET
-from tests.common import charger_of, running, setup_bus, subentry_id
+from tests.common import (
+    call,
+    charger_of,
+    get_entity,
+    running,
+    setup_bus,
+    subentry_id,
+)
 from tests.flow import IMPOSED, Flow, charger, port_step, smartevse_step
 from tests.virtual import Car, EvboxChargePoint, SmartEvse, VirtualBus
 
@@ -129,6 +136,36 @@ async def test_an_entry_removed_and_added(hass: HomeAssistant) -> None:
         await asyncio.sleep(INTERVAL * 2)
         check(point, at_least=3)
         await hass.config_entries.async_unload(again.entry_id)
+
+
+@pytest.mark.parametrize("how", ["reload", "disable", "change"])
+async def test_orders_that_have_expired_stay_so(hass: HomeAssistant, how: str) -> None:
+    """No current comes back because the config entry is set up again."""
+    point = EvboxChargePoint(1923054)
+    async with running(hass, point, order_lifetime=1, poll_interval=2.0) as (entry, _):
+        limit = await get_entity(hass, "number", entry, "charging_current")
+        await call(hass, "number.set_value", limit, value=12)
+        await asyncio.sleep(30)
+        assert point.limits_in_force == (12.0, 12.0, 12.0)
+        await asyncio.sleep(40)
+        assert point.limits_in_force == (6.0, 6.0, 6.0)
+        before = len(point.orders)
+        if how == "change":
+            subentry = entry.subentries[subentry_id(entry)]
+            hass.config_entries.async_update_subentry(
+                entry, subentry, data={**subentry.data, "information": "01" * 16}
+            )
+        elif how == "reload":
+            await hass.config_entries.async_reload(entry.entry_id)
+        else:
+            by = ConfigEntryDisabler.USER
+            await hass.config_entries.async_set_disabled_by(entry.entry_id, by)
+            await hass.config_entries.async_set_disabled_by(entry.entry_id, None)
+        await asyncio.sleep(30)
+        assert len(point.orders) > before + 5
+        assert {order.limits for order in point.orders[before:]} == {(6.0,) * 3}
+        await call(hass, "number.set_value", limit, value=12)
+        assert point.limits_in_force == (12.0, 12.0, 12.0)
 
 
 async def test_a_later_smartevse_has_its_quiet_after_a_search_and_reloads(

@@ -137,6 +137,7 @@ class ListenerConnections(Connections):
         ``on_unknown_box`` is called with each box that dials and is not configured.
         """
         self.name = connection_name(entry.data)
+        self._hass = hass
         self.listener = protocol_of(entry.data).listen_at(
             entry.data[CONF_HOST],
             entry.data[CONF_PORT],
@@ -181,7 +182,10 @@ class ListenerConnections(Connections):
     async def acquire_bus(self, config: ChargerConfig, name: str) -> Bus:
         serial = config.serial or ""
         addresses = await self._addresses.async_get(serial)
-        bus = self._buses[serial] = self.listener.register(serial, name, addresses)
+        bus = self.listener.register(
+            serial, name, addresses, line_memory(self._hass, f"{DOMAIN}:{serial}")
+        )
+        self._buses[serial] = bus
         if self._started:
             await bus.start()
         return bus

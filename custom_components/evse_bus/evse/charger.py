@@ -30,7 +30,7 @@ from .framing import Frame, Timing
 from .jobs import Job, merge_key
 from .line import Line
 from .listeners import Observable
-from .memory import LineMemory
+from .memory import LineMemory, Renewals
 from .model import (
     Capability,
     ChargerConfig,
@@ -141,7 +141,8 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         self.slot = Slot(kind=Kind.PROBE)
         self._conversations = 0
         self.bus: Scheduler | None = None
-        self._renewed: float | None = None
+        self._renewals = Renewals()
+        """That of the line, once it is on a bus."""
         self._clamped: tuple[tuple[Orders, Limits], Setpoint] | None = None
         self._reason: tuple[tuple[Orders, Limits], PauseReason | None] | None = None
 
@@ -314,6 +315,7 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
 
         Called when it is put on a bus, before it is polled.
         """
+        self._renewals = memory.of(Renewals)
 
     @abstractmethod
     def on_line_open(self) -> None:
@@ -437,7 +439,7 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         checked = check_change(change, self.limits)
         loop = asyncio.get_running_loop()
         if checked.is_about_now:
-            self._renewed = loop.time()
+            self._renewals.at[self.config.key] = loop.time()
             self.orders_expired = False
         self._requested = checked.apply(self._requested)
         lowered = cautious(self.orders, checked.apply(self.orders))
@@ -512,10 +514,9 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         lifetime = self.config.order_lifetime
         if lifetime is None or self.orders_expired:
             return False
-        if self._renewed is None:
-            # Counted from the first turn, so that automations can renew after a restart.
-            self._renewed = now
-        if now - self._renewed < lifetime:
+        # Counted from the first turn, so that automations can renew after a restart.
+        renewed = self._renewals.at.setdefault(self.config.key, now)
+        if now - renewed < lifetime:
             return False
         self.orders_expired = True
         _LOGGER.warning(

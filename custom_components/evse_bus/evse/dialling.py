@@ -10,6 +10,7 @@ from ipaddress import IPv4Address, IPv4Network, IPv6Address, IPv6Network
 from typing import Protocol
 
 from .bus import Bus
+from .memory import LineMemory
 from .readings import ChargerInfo
 
 type Address = IPv4Address | IPv6Address
@@ -82,12 +83,16 @@ class Listener(Protocol):
         """
 
     def register(
-        self, serial: str, name: str = "", addresses: Iterable[Address] = ()
+        self,
+        serial: str,
+        name: str = "",
+        addresses: Iterable[Address] = (),
+        memory: LineMemory | None = None,
     ) -> Bus:
         """Return the bus of a box, which waits until the box dials.
 
         ``addresses``: from which it has dialled before, the last one first. Places are
-        kept for them.
+        kept for them. ``memory``: what is known of this box; ``None``: nothing.
         """
 
     async def unregister(self, serial: str) -> None:

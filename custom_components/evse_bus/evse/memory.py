@@ -12,6 +12,15 @@ must outlive that is stored with the configuration or the orders.
 from math import inf
 
 
+class Renewals:
+    """When the orders of chargers were renewed last."""
+
+    def __init__(self) -> None:
+        """Know no charger."""
+        self.at: dict[str, float] = {}
+        """Loop times, s, by the key of a charger's configuration."""
+
+
 class LineMemory:
     """What is known of one line, whichever bus is on it."""
 

@@ -212,6 +212,7 @@ class EvboxCharger(Charger[EvboxConfig]):
 
     @override
     def resume(self, memory: LineMemory) -> None:
+        super().resume(memory)
         self._memory = memory.of(EvboxMemory)
         self._plausibility.interval = self._memory.interval(self.config.addressed)
 

@@ -142,6 +142,7 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
 
     @override
     def resume(self, memory: LineMemory) -> None:
+        super().resume(memory)
         self._line_memory = memory
 
     @override

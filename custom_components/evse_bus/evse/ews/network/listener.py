@@ -31,6 +31,7 @@ from ...errors import EvseError, LineError, PortBusyError, PortMissingError
 from ...exchange import Turn, Wire
 from ...framing import Frame
 from ...line import line_error
+from ...memory import LineMemory
 from ...statistics import ChargerStatistics
 from ...throttle import LOSSES, LOSSES_WINDOW, RateLimiter
 from ..box import BoxMemory, EwsBox
@@ -183,18 +184,25 @@ class Listener:
     # -- Registered boxes ------------------------------------------------------------
 
     def register(
-        self, serial: str, name: str = "", addresses: Iterable[Address] = ()
+        self,
+        serial: str,
+        name: str = "",
+        addresses: Iterable[Address] = (),
+        memory: LineMemory | None = None,
     ) -> Bus:
         """Return the bus of a box; it waits until the box dials.
 
         The caller adds the ports and starts it. An unknown box of this number that is
         connected already is used at once. ``name`` is for log messages;
-        ``addresses``: from which it has dialled before, the last one first.
+        ``addresses``: from which it has dialled before, the last one first;
+        ``memory``: what is known of this box.
         """
         if (known := self._registered.get(serial)) is not None:
             return known.bus
         framer = EwsFramer()
         line = AcceptedLine(name or f"EWS-Box {serial}", lambda: framer.noise)
+        if memory is not None:
+            line.memory = memory
         # Otherwise it would keep out the box whose number it gave when it dialled.
         ports = BoxPorts(on_wrong_box=partial(line.end, "another box answers"))
         bus = Bus(line, framer, TCP_TIMING, name, group=ports)
