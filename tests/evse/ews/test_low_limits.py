@@ -5,7 +5,7 @@ import asyncio
 from hypothesis import example, given, settings, strategies as st
 import pytest
 
-from custom_components.evse_bus.evse.model import OrderChange, PauseReason
+from custom_components.evse_bus.evse.model import Command, OrderChange, PauseReason
 
 from .scene import EwsScene, play
 
@@ -61,6 +61,49 @@ def test_a_withheld_start_ends_with_the_word_of_the_user() -> None:
         assert not scene.line.orders()
 
     play(EwsScene(), acts)
+
+
+@pytest.mark.parametrize("command", [Command.STOP_AND_UNLOCK, Command.UNLOCK])
+def test_a_withheld_start_ends_with_a_command_that_unlocks(command: Command) -> None:
+    """The car stays in 0x30: a higher limit alone must not start it."""
+
+    async def acts(scene: EwsScene) -> None:
+        charger = scene.charger()
+        await charger.change_orders(amperes(0.0))
+        await scene.plug()
+        if command is Command.UNLOCK:
+            await charger.command(Command.LOCK)
+        await charger.change_orders(ON)
+        assert charger.waits_for_current
+        await charger.command(command)
+        await asyncio.sleep(5)
+        assert scene.status() == 0x30
+        assert not charger.waits_for_current
+        await charger.change_orders(amperes(16.0))
+        await asyncio.sleep(60)
+        assert not scene.line.orders(START)
+
+    play(EwsScene(), acts)
+
+
+def test_a_withheld_start_ends_with_a_restart_too_short_to_be_seen() -> None:
+    """Another car may be plugged in: the restart flag alone shows it."""
+
+    async def acts(scene: EwsScene) -> None:
+        charger = scene.charger()
+        await charger.change_orders(amperes(0.0))
+        await scene.plug()
+        await charger.change_orders(ON)
+        assert charger.waits_for_current
+        scene.box.power_cycle(0.0)
+        await asyncio.sleep(20)
+        assert scene.status() == 0x30
+        assert not charger.waits_for_current
+        await charger.change_orders(amperes(16.0))
+        await asyncio.sleep(60)
+        assert not scene.line.orders()
+
+    play(EwsScene(options={"init_time": 0.0}), acts)
 
 
 @pytest.mark.parametrize("how", ["leaves", "line", "power"])

@@ -382,6 +382,9 @@ class EwsBox:
             self.details = None
             before = None
         self._check_restart(restarted)
+        # Not that of an earlier reply: one that a box clears when it is read would hide
+        # a restart before the next reading.
+        self._restart_flag = BoxFlags.RESTARTED in status.flags
         self._report_card(before, status)
         return status
 
@@ -391,7 +394,6 @@ class EwsBox:
         if restarted and not self._restart_flag:
             self.restarts += 1
             self.parameters_due = self._clock_after = -inf
-        self._restart_flag = restarted
 
     def _report_card(self, before: BoxStatus | None, status: BoxStatus) -> None:
         card, changed = status.card, self._card_changed

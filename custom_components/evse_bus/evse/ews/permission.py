@@ -200,12 +200,12 @@ class Permission:
     def forget(self) -> None:
         """Take note that a command has stopped the charge or unlocked the plug."""
         self._tracker.end()
-        self._start_withheld = False
+        self._withheld_in = None
 
     def doubt(self) -> None:
         """Take note that the box has restarted: our pause may be over."""
         self._tracker.doubt()
-        self._start_withheld = False
+        self._withheld_in = None
 
     def on_lost(self) -> None:
         """Take note that the port is out of sight: another car may come unnoticed."""
