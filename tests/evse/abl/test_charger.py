@@ -157,6 +157,23 @@ async def test_a_reply_to_another_request_changes_nothing() -> None:
         await until(lambda: charger.available)
 
 
+@pytest.mark.parametrize("each_way", [0.05, 0.16, 0.4])
+async def test_a_box_behind_a_slow_adapter_is_available(each_way: float) -> None:
+    """From 160 ms each way all replies came after the time-out of a fast line."""
+    async with Scene(AblBox(1)) as scene:
+        adapter = scene.virtual.adapter
+        adapter.delay_out = adapter.delay_in = each_way
+        charger = scene.add(config(poll_interval=2.0), orders(16))
+        await until(lambda: charger.available, 30)
+        gone: list[bool] = []
+        charger.subscribe(lambda: gone.append(not charger.available))
+        await charger.change_orders(OrderChange(current=8.0))
+        assert 7.9 < scene.boxes[0].ic_amps <= 8.0
+        await asyncio.sleep(300)
+        assert gone
+        assert not any(gone)
+
+
 async def test_a_dead_box_becomes_unavailable_and_comes_back() -> None:
     async with Scene(AblBox(1)) as scene:
         charger = await scene.settled(config(), orders(10))
