@@ -42,7 +42,8 @@ byte comes before it. Cars come and go, the orders change every {BETWEEN_ORDERS[
 Wrong is a published value that the box had at no time in the 6 s before, one still
 shown after 30 s (a value that is asked for less often: so much later), a total beyond
 the meter or one that falls, an identity that is not that of the box. A keep-alive is
-missed when the box says so: EVBox time-out, ABL F4 after 30 s."""
+missed when the box says so: EVBox time-out, ABL F4 after 30 s, SmartEVSE NO_COMM, an
+EWS-Box without a command for 30 s."""
 
 
 @dataclass(frozen=True, slots=True)
