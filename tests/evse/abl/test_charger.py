@@ -1,6 +1,7 @@
 """One box on a wire: its identity, its readings, and missing replies."""
 
 import asyncio
+from dataclasses import replace
 
 import pytest
 
@@ -208,6 +209,20 @@ async def test_nothing_is_written_to_the_wrong_box() -> None:
         box.serial = "2W22xy01234567"
         await until(lambda: charger.available and box.outlet.icmax == 1000)
         assert Fault.WRONG_CHARGER not in charger.faults
+
+
+async def test_a_serial_number_typed_in_later_is_checked_before_the_next_write() -> (
+    None
+):
+    async with Scene(AblBox(1)) as scene:
+        charger = await scene.settled(config(), orders(16))
+        await scene.stop_polls(charger)
+        typed = replace(charger.config, serial="2W22xy99999999")
+        charger.reconfigure(typed)
+        with pytest.raises(WrongChargerError):
+            await charger.change_orders(OrderChange(current=8))
+        assert scene.writes() == []
+        assert Fault.WRONG_CHARGER in charger.faults
 
 
 async def test_a_box_replaced_while_the_adapter_was_away() -> None:

@@ -136,6 +136,9 @@ class AblReader(Charger[AblConfig]):
     def reconfigure(self, config: ChargerConfig) -> None:
         super().reconfigure(config)
         self._energy.set_interval(config.poll_interval)
+        if config.serial not in (None, self._serial):
+            # It was typed in: another box may answer.
+            self.require_identification()
 
     @property
     def has_meter(self) -> bool:
