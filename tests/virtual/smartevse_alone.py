@@ -39,6 +39,7 @@ class SmartEvseAlone:
         unit: int | None = None,
         override_works: bool = True,
         serial: int = 1,
+        factory_new: bool = False,
         **settings: int,
     ) -> None:
         """Switch it on."""
@@ -49,6 +50,7 @@ class SmartEvseAlone:
             unit=unit,
             override_works=override_works,
             serial=serial,
+            factory_new=factory_new,
             settings=settings,
         )
         self.now = 0.0

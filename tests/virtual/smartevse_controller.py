@@ -43,6 +43,8 @@ class SmartEvseController:
     """The controller of one box, with its outlet.
 
     `override_works`, `ignore_access`: defects, or missing in an earlier firmware.
+    `factory_new`: it stored its settings when it was switched on, and reports them as
+    changed until a power cycle (2.30 and HEAD, `reads`).
     `receive` takes one frame; after `step`, `sending` has the frames to send.
     """
 
@@ -56,6 +58,7 @@ class SmartEvseController:
         unit: int | None = None,
         serial: int = 1,
         override_works: bool = True,
+        factory_new: bool = False,
     ) -> None:
         """Make a controller that was just switched on."""
         self.dialect = dialect
@@ -72,7 +75,7 @@ class SmartEvseController:
         self.requests_sent: list[Handshake] = []
         self.answers: list[Handshake] = []
         self.slave_requests: list[tuple[int, Handshake]] = []
-        self.config_changed = 0
+        self.config_changed = int(factory_new)
         self.dropped = 0
         self.ignored = 0
         self._last_request: tuple[int, int] | None = None
@@ -288,7 +291,8 @@ class SmartEvseController:
     def _set_mode(self, value: int) -> bool:
         """Set the mode without storing it."""
         out = self.outlet
-        if self.dialect.gentle and (out.disabled or out.settings["mode"] == NORMAL):
+        later = self.dialect.status_writable
+        if later and (out.disabled or out.settings["mode"] == NORMAL):
             return True
         mode = self.dialect.settings["mode"]
         if not mode.low <= value <= mode.high:
@@ -310,7 +314,8 @@ class SmartEvseController:
             out.solar_timer = value
         elif item == "config_changed":
             self.config_changed = value
-        elif item == "phases" and value <= 3:
+        elif item == "phases" and value <= 3 and self.dialect.gentle:
+            # 2.30 refuses it (`normal`).
             out.phases = value
         else:
             return False

@@ -14,7 +14,7 @@ from .smartevse_registers import (
 )
 from .smartevse_states import CHARGE_DELAY, NEVER, STOP_DELAY, SmartEvseStates, pwm_of
 
-# In device time, s. A second of the recorded box is a little short.
+# In device time, s. A second of the recorded 2.17 is a little short.
 STEP = 0.01
 SECOND = 0.989
 COMM_TIMEOUT = 10
@@ -24,7 +24,12 @@ POLLING = 0.1
 
 
 class SmartEvseOutlet(SmartEvseStates):
-    """One outlet with a clock: `step` brings it up to a time."""
+    """One outlet with a clock: `step` brings it up to a time.
+
+    `second`: the duration of its second, s.
+    """
+
+    second = SECOND
 
     # Time
 
@@ -32,7 +37,7 @@ class SmartEvseOutlet(SmartEvseStates):
         """Advance to `now`."""
         if self._now is None or self._second_at is None:
             self._now = now
-            self._second_at = now + SECOND
+            self._second_at = now + self.second
         while self._now < now:
             self._now = min(now, self._now + STEP)
             self._live(self._now)
@@ -51,7 +56,7 @@ class SmartEvseOutlet(SmartEvseStates):
             self._cycle_at = None
             self.calculate()
         if self._second_at is not None and now >= self._second_at:
-            self._second_at += SECOND
+            self._second_at += self.second
             self._every_second(now)
         if self.error & NO_COMM and self.comm_timeout == COMM_TIMEOUT:
             self.error &= ~NO_COMM

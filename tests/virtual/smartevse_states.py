@@ -295,7 +295,11 @@ class SmartEvseStates:
                     self._ask("G", now)
                 elif self._enough():
                     self.go("C")
-                    self._recalculate()
+                    if self.dialect.gentle:
+                        # Until its first cycle (HEAD, `normal`: 9 s after access).
+                        self.current = 0
+                    else:
+                        self._recalculate()
                 else:
                     self._lack()
         else:
@@ -378,6 +382,5 @@ class SmartEvseStates:
             return None
         if self._measured_from is None:
             self._measured_from = self._now
-            return None
         elapsed = self._now - self._measured_from
         return next((one for until, one in MEASUREMENT if elapsed < until), None)
