@@ -8,7 +8,9 @@ import pytest
 from custom_components.evse_bus.evse.abl import reader
 from custom_components.evse_bus.evse.errors import GarbledReplyError, WrongChargerError
 from custom_components.evse_bus.evse.model import Capability, Fault, OrderChange, Status
+from tests.simulated_time import now
 from tests.virtual import AblBox, Car, Request
+from tests.virtual.abl_outlet import Outlet
 
 from .scene import LIMIT, Scene, answers, config, orders, until
 
@@ -121,6 +123,21 @@ async def test_a_missing_optional_register_is_no_missed_reply() -> None:
         assert two.reading.details["icmax_duty"] == 16.6
         # Probed three times, not with every poll.
         assert len(scene.reads(1, 0x0F)) == 3
+
+
+async def test_a_car_that_slows_down_is_no_overcurrent_for_long(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its flag is read again at the next poll, not after `FLAGS_INTERVAL`."""
+    bits = 0b101
+    monkeypatch.setattr(Outlet, "overcurrent", property(lambda _outlet: bits))
+    async with Scene(AblBox(1)) as scene:
+        charger = await scene.settled(config(poll_interval=2.0), orders())
+        await until(lambda: Fault.OVERCURRENT in charger.faults, 40)
+        bits = 0
+        begin = now()
+        await until(lambda: Fault.OVERCURRENT not in charger.faults, 40)
+        assert now() - begin < 2.5
 
 
 async def test_flags_that_stay_away_are_dropped_after_a_while(

@@ -290,7 +290,8 @@ class AblReader(Charger[AblConfig]):
     async def poll_status(self, turn: Turn) -> Reading:
         """Read the status once, and the flags where due; keep and return it.
 
-        The flags are due every `FLAGS_INTERVAL`, and when the status has changed.
+        The flags are due every `FLAGS_INTERVAL`, when the status has changed, and at
+        each poll while the car draws too much.
         """
         status = await self._read_reading(turn)
         await self.read_icmax(turn)
@@ -498,7 +499,9 @@ class AblReader(Charger[AblConfig]):
                 self._flags_due = turn.now + FLAGS_INTERVAL
             return
         self._flags_missed = 0
-        self._flags_due = turn.now + FLAGS_INTERVAL
+        # A car that is still slowing down draws too much for a moment only.
+        passes = (self._flags.overcurrent or 0) > 0
+        self._flags_due = turn.now + (0.0 if passes else FLAGS_INTERVAL)
         if self._info is not None:
             self.info = charger_info(self._info, self._serial, self._flags)
 
