@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 from . import commands, ews_cli
+from .adapter import GatewayKind
 from .car import CarLife
 from .faults import DAMAGES
 from .smartevse_registers import DIALECTS
@@ -359,8 +360,9 @@ def _adapter(group: argparse._ArgumentGroup) -> None:
     )
     add(
         "--gateway",
-        choices=["silent", "closes", "answers"],
-        help="expects Modbus TCP in place of passing bytes; what it does with others",
+        choices=get_args(GatewayKind),
+        help="expects Modbus TCP in place of passing bytes; what it does with others; "
+        "mute: no answer to Modbus TCP either",
     )
     add("--echo", action="store_true", help="echoes the client's bytes")
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import datetime
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 from .abl import AblBox
-from .adapter import ModbusTcpGateway
+from .adapter import GatewayKind, ModbusTcpGateway
 from .evbox import EvboxChargePoint
 from .ews_box import EwsBox
 from .ews_cli import EwsFleet
@@ -76,6 +76,9 @@ def _delay(adapter: Any, values: Values) -> None:  # noqa: ANN401 - an adapter
 
 def _gateway(adapter: Any, values: Values) -> None:  # noqa: ANN401 - an adapter
     kind: Any = values[0]
+    if kind not in ("no", *get_args(GatewayKind)):
+        message = f"{kind} is no kind of gateway"
+        raise ValueError(message)
     adapter.gateway = None if kind == "no" else ModbusTcpGateway(kind)
 
 
@@ -127,7 +130,7 @@ BUS: Mapping[str, Command] = {
         _on_adapters(_setter("idle_timeout", _seconds_or_none)),
     ),
     "gateway": Command(
-        "no|silent|closes|answers",
+        "no|silent|closes|answers|mute",
         "it expects Modbus TCP in place of passing bytes",
         _on_adapters(_gateway),
     ),
@@ -200,6 +203,10 @@ def _dead(*, dead: bool) -> Callable[..., None]:
     return run
 
 
+def _turn_round(device: Any, _part: int, values: Values) -> None:  # noqa: ANN401 - several kinds
+    device.turn_round = float(values[0])
+
+
 def _serial(device: Any, _part: int, values: Values) -> None:  # noqa: ANN401 - several kinds
     kind = type(device.serial)
     device.serial = kind(values[0])
@@ -214,6 +221,7 @@ ALL: Mapping[str, Command] = {
     "serial": Command("TEXT", "another box in its place", _serial),
     "lose": Command("", "the next reply is lost", _once("lose")),
     "late": Command("S", "the next reply is late", _once("late")),
+    "turn-round": Command("S", "so long before each of its replies", _turn_round),
     "duplicate": Command("", "the next reply comes twice", _once("duplicate")),
     "truncate": Command("N", "the next reply ends after N bytes", _once("truncate")),
     "corrupt": Command(

@@ -137,6 +137,14 @@ def test_faults_of_one_reply(abl: Desk) -> None:
     assert abl.client.ask(READ_FULL) == b"\x00" + good
 
 
+def test_a_box_that_replies_later_than_others(abl: Desk) -> None:
+    good = abl.client.ask(READ_FULL)
+    abl.do("turn-round 1 0.4")
+    for _ in range(2):
+        assert abl.client.ask(READ_FULL, timeout=0.3) == b""
+        assert abl.client.read(len(good)) == good
+
+
 def test_two_boxes_with_one_id_by_serial_number(abl: Desk) -> None:
     box = abl.device
     assert isinstance(box, AblBox)
@@ -254,6 +262,9 @@ def test_adapters(abl: Desk) -> None:
     assert (adapter.delay_out, adapter.delay_in, adapter.jitter) == (0.1, 0.2, 0.05)
     assert adapter.idle_timeout == 30
     assert adapter.gateway is not None
+    assert "maybe is no kind of gateway" in abl.error("gateway maybe")
+    abl.do("gateway mute")
+    assert adapter.gateway.kind == "mute"
     abl.do("delay 0", "jitter 0", "idle-timeout 0", "gateway no")
     assert (adapter.delay_in, adapter.idle_timeout, adapter.gateway) == (0, None, None)
     assert abl.client.ask(READ_FULL)
