@@ -28,6 +28,8 @@ class Adapter(TelegramLine):
         """It closes a connection without traffic after this time, s."""
         self.silent_connections = False
         """It accepts each connection, delivers nothing, and closes it."""
+        self.closes_at_requests = False
+        """It greets, and closes each connection at the first request."""
         self.opening_time = 0.0
         """Time that each attempt to open it takes, s."""
         self.opened: list[float] = []
@@ -41,11 +43,16 @@ class Adapter(TelegramLine):
         self.hung = False
         if self.silent_connections:
             asyncio.get_running_loop().call_later(0.01, self.unplug)
+        if self.closes_at_requests:
+            asyncio.get_running_loop().call_later(0.01, super().hear, b"hello")
         self._traffic()
 
     @override
     def write(self, data: bytes, *, reply_may_equal: bool = False) -> float:
         self._traffic()
+        if self.closes_at_requests:
+            asyncio.get_running_loop().call_later(0.05, self.unplug)
+            return now()
         return super().write(data, reply_may_equal=reply_may_equal)
 
     @override
@@ -214,7 +221,7 @@ def test_the_pauses_begin_anew_only_after_a_received_byte() -> None:
     line = LineRecovery()
     first = [line.next_pause() for _ in range(6)]
     assert first == [*PAUSES, PAUSES[-1], PAUSES[-1]]
-    line.opened()
+    line.opened(0.0)
     assert line.next_pause() == PAUSES[-1]
     line.received()
     assert line.next_pause() == PAUSES[0]
@@ -231,6 +238,29 @@ def test_a_line_lost_while_it_worked_is_opened_at_once() -> None:
             adapter.on_lost(LineLostError("idle"))
             await asyncio.sleep(0.1)
             assert adapter.opened[-1] - lost < 0.001
+
+    simulate(scene())
+
+
+def test_an_adapter_that_greets_and_then_closes_at_each_request() -> None:
+    """Its bytes are no replies: no reading gets old, and nobody dials all the time."""
+
+    async def scene() -> None:
+        bus = Scene(addresses=(1,), interval=1.0)
+        adapter = behind_adapter(bus)
+        async with bus:
+            await asyncio.sleep(5)
+            assert bus.charger(1).available
+            adapter.closes_at_requests = True
+            adapter.unplug()
+            start = len(adapter.opened)
+            await asyncio.sleep(100)
+            assert not bus.charger(1).available
+            assert bus.charger(1).reading is None
+            assert len(adapter.opened) - start <= 100
+            adapter.closes_at_requests = False
+            await asyncio.sleep(10)
+            assert bus.charger(1).available
 
     simulate(scene())
 

@@ -106,7 +106,7 @@ class Wire:
         """Drop an incomplete frame: the line was opened anew."""
         self._framer.reset()
         self._unanswered.clear()
-        self.recovery.opened()
+        self.recovery.opened(asyncio.get_running_loop().time())
 
     def fail(self, error: LineLostError) -> None:
         """End the exchange under way: the line is gone."""
@@ -144,6 +144,7 @@ class Wire:
         self.frames.add(Direction.OUT, self._framer.redacted(data))
         self.statistics.requests += 1
         counted.requests += 1
+        self.recovery.asked()
         try:
             await pending.future
             pending = await self._last_reply(pending, accept, sent)
@@ -164,8 +165,7 @@ class Wire:
             pending.close()
             self._pending = None
             if pending.answered_at is not None:
-                self.line.answered()
-                self.statistics.replies += 1
+                self._note_reply()
                 counted.reply(pending.answered_at - started)
                 if not patience and self._late_request(pending.frame) is None:
                     self._measure(pending.answered_at - sent)
@@ -178,6 +178,11 @@ class Wire:
             if self._is_disturbed(bad, noise, counted):
                 raise GarbledReplyError("unreadable bytes came beside a reply")
         return result  # type: ignore[return-value] # accept's own type
+
+    def _note_reply(self) -> None:
+        self.line.answered()
+        self.recovery.answered()
+        self.statistics.replies += 1
 
     async def _last_reply(
         self,

@@ -144,11 +144,12 @@ class Port:
 
     def line_lost(self, error: LineLostError) -> None:
         """Take note that the line is gone, by no act of ours."""
-        self._wire.gateway.lost(asyncio.get_running_loop().time())
+        now = asyncio.get_running_loop().time()
+        self._wire.gateway.lost(now)
         if self.state is not PortState.OPEN:
             # While it was being opened: that attempt has failed.
             return
-        if self._wire.recovery.worked and not self._wire.line.opened_by_peer:
+        if self._wire.recovery.works(now) and not self._wire.line.opened_by_peer:
             # Some adapters close an idle connection: it is opened again at once, and
             # a charger that then answers was never unavailable.
             self._interrupted(error)

@@ -14,6 +14,9 @@ attempt of at most `line.OPEN_TIMEOUT` it is back within 10 s of its adapter."""
 SILENCES: Final = (30.0, 60.0, 120.0, 300.0)
 """Times without any received byte after which a silent line is opened anew, s; the last
 one for ever: the chargers may simply be off."""
+LASTED: Final = 1.0
+"""An adapter that closes a connection of which nothing was asked has not refused it if
+it has lasted so long, s."""
 
 
 class LineRecovery:
@@ -21,26 +24,42 @@ class LineRecovery:
 
     def __init__(self) -> None:
         """Start with a line that was never open."""
-        self._delivered = False
+        self._answered = False
+        self._owed = True
+        """The last request was not answered, or there was none."""
+        self._opened_at = -inf
         self._attempts = 0
         self._renewals = 0
         self._unanswered_since: float | None = None
 
-    @property
-    def worked(self) -> bool:
-        """Return whether bytes were received since it was opened."""
-        return self._delivered
+    def works(self, now: float) -> bool:
+        """Return whether its requests are answered, as far as any were sent on it.
 
-    def opened(self) -> None:
+        Bytes alone prove nothing: an adapter may send a greeting, and close the
+        connection at the first request.
+        """
+        lasted = now - self._opened_at >= LASTED
+        return self._answered or (lasted and not self._owed)
+
+    def opened(self, now: float) -> None:
         """Take note of an opened line."""
-        self._delivered = False
+        self._answered = False
+        self._opened_at = now
         self._unanswered_since = None
+
+    def asked(self) -> None:
+        """Take note of a request."""
+        self._owed = True
 
     def received(self) -> None:
-        """Take note of a received byte: this line works."""
-        self._delivered = True
+        """Take note of a received byte: this line is not silent."""
         self._attempts = self._renewals = 0
         self._unanswered_since = None
+
+    def answered(self) -> None:
+        """Take note of its reply."""
+        self._answered = True
+        self._owed = False
 
     def unanswered(self, now: float) -> None:
         """Take note of a request without any reply."""

@@ -340,7 +340,9 @@ async def close_when_idle(line: EvboxLine, idle: float) -> None:
             line.unplug()
 
 
-@pytest.mark.parametrize(("interval", "idle"), [(20, 10.0), (5, 3.0), (1, 3.0)])
+@pytest.mark.parametrize(
+    ("interval", "idle"), [(20, 10.0), (20, 3.0), (5, 3.0), (1, 3.0)]
+)
 def test_an_adapter_that_closes_idle_lines_takes_no_current(
     interval: int, idle: float
 ) -> None:
