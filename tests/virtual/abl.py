@@ -14,6 +14,7 @@ from .abl_frames import (
     LineFinder,
     Request,
     line,
+    twin_errors,
 )
 from .abl_outlet import Outlet
 from .abl_registers import BLOCKS, BROADCAST_READS, EXTRA_BLOCKS, ICMAX_BLOCK
@@ -109,6 +110,7 @@ class AblBox(Device):
             upstream_timeout=upstream_timeout,
             enable_input=enable_input,
         )
+        self.faults.twin = twin_errors
         self.firmware = firmware
         self.hardware = hardware
         self.coding_resistor = cable_current is not None

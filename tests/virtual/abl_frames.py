@@ -10,8 +10,11 @@ from dataclasses import dataclass
 import math
 from typing import TYPE_CHECKING
 
+from .faults import opposite_flips
+
 if TYPE_CHECKING:
     from collections.abc import Iterable
+    from random import Random
 
     from .log import Entry
     from .wire import Segment
@@ -65,6 +68,15 @@ def amps_of(duty: int) -> float:
     if duty <= 850:
         return duty * 0.06
     return min(80.0, (duty / 10 - 64) * 2.5)
+
+
+def twin_errors(reply: bytes, rng: Random) -> bytes:
+    """Flip two bits in the contents of a line; its LRC still fits."""
+    # Stray bytes may come first.
+    stray, begin, text = reply.rpartition(b">")
+    data = bytes.fromhex(text.decode("ascii"))
+    damaged = data[:3] + opposite_flips(data[3:-1], rng) + data[-1:]
+    return stray + begin + damaged.hex().upper().encode("ascii") + b"\r\n"
 
 
 @dataclass(frozen=True, slots=True)

@@ -229,7 +229,7 @@ ALL: Mapping[str, Command] = {
     ),
     "twin-error": Command(
         "",
-        "the same bit in two bytes of it flips: an XOR (BCC) still fits",
+        "two bits of it flip; any checksum but a CRC still fits",
         _once("twin"),
     ),
     "replace": Command(

@@ -16,6 +16,7 @@ from .evbox_frames import (
     checked,
     frame,
     order,
+    twin_errors,
     word,
 )
 from .log import CLIENT
@@ -121,6 +122,7 @@ class EvboxChargePoint(Device):
         """Make a ChargePoint; its limits are its maximum until an order comes."""
         self.serial = f"{int(serial):08d}"
         super().__init__(name or f"evbox-{int(serial)}")
+        self.faults.twin = twin_errors
         if isinstance(modules, int):
             modules = [Module() for _ in range(modules)]
         self.modules = modules

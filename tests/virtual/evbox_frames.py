@@ -9,10 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from .faults import opposite_flips
 from .log import CLIENT
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
+    from random import Random
 
     from .log import Entry
     from .wire import Segment
@@ -45,6 +47,12 @@ def checksums(text: str) -> str:
 def frame(text: str) -> bytes:
     """Return a whole frame around the text."""
     return bytes((STX,)) + (text + checksums(text)).encode("ascii") + bytes((ETX,))
+
+
+def twin_errors(reply: bytes, rng: Random) -> bytes:
+    """Flip two bits behind the header of a frame; SUM and XOR still fit."""
+    begin, end = 1 + HEADER_CHARS, -1 - CHECKSUM_CHARS
+    return reply[:begin] + opposite_flips(reply[begin:end], rng, HEX) + reply[end:]
 
 
 @dataclass(frozen=True, slots=True)

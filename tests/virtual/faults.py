@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Container
     from random import Random
 
 Kind = Literal[
@@ -16,14 +17,50 @@ Damage = Literal["flip", "replace", "drop", "insert"]
 DAMAGES: tuple[Damage, ...] = ("flip", "replace", "drop", "insert")
 
 
+def twin_flips(data: bytes, rng: Random) -> bytes:
+    """Flip the same bit in two bytes: an XOR of all bytes does not show it.
+
+    Neither in the first byte nor in the last one: they delimit a frame.
+    """
+    damaged, bit = bytearray(data), 1 << rng.randrange(8)
+    for index in rng.sample(range(1, len(data) - 1), 2):
+        damaged[index] ^= bit
+    return bytes(damaged)
+
+
+def opposite_flips(
+    data: bytes, rng: Random, possible: Container[int] = range(256)
+) -> bytes:
+    """Set a bit in one byte and clear it in another: a sum does not show it either.
+
+    Both become one of the `possible` bytes. Without such a pair nothing changes.
+    """
+    pairs = [
+        (one, other, bit)
+        for bit in (1 << place for place in range(8))
+        for one, up in enumerate(data)
+        if not up & bit and up ^ bit in possible
+        for other, down in enumerate(data)
+        if down & bit and down ^ bit in possible
+    ]
+    damaged = bytearray(data)
+    if pairs:
+        one, other, bit = rng.choice(pairs)
+        damaged[one] ^= bit
+        damaged[other] ^= bit
+    return bytes(damaged)
+
+
 @dataclass(slots=True)
 class Faults:
     """Faults of one device, or of the whole bus (`bus.faults`).
 
     Rates are probabilities per reply, `byte_error_rate` per byte. All can be set at
     any time from any thread. `damage`: what a byte error does, one at random: one bit
-    flips, another byte is in its place, it is lost, a byte comes before it. `echo` and `noise_rate` (bytes per second) count on the
-    bus only; `dead` on the bus is a cut cable: no byte reaches any device.
+    flips, another byte is in its place, it is lost, a byte comes before it. `echo` and
+    `noise_rate` (bytes per second) count on the bus only; `dead` on the bus is a cut
+    cable: no byte reaches any device. `twin` damages a reply in a way that the checksum
+    of its protocol does not show.
     """
 
     byte_error_rate: float = 0.0
@@ -36,6 +73,7 @@ class Faults:
     dead: bool = False
     echo: bool = False
     noise_rate: float = 0.0
+    twin: Callable[[bytes, Random], bytes] = twin_flips
     happened: dict[str, int] = field(default_factory=dict)
     _once: deque[tuple[Kind, object]] = field(default_factory=deque)
 
@@ -47,7 +85,7 @@ class Faults:
         - `duplicate`: sent twice
         - `truncate`: cut to its first `value` bytes (default half)
         - `corrupt`: one bit of byte `value` flips (default the middle one)
-        - `twin`: the same bit flips in two bytes, which an XOR of all does not show
+        - `twin`: two bits flip so that the checksum still fits (EWS, EVBox, ABL)
         - `replace`: the bytes `value` are sent in its place
         - `noise`: the bytes `value` are sent just before it
         """
@@ -131,11 +169,7 @@ class Faults:
             damaged[index] ^= 1 << rng.randrange(7)
             first = [(delay, bytes(damaged))]
         elif kind == "twin":
-            damaged, bit = bytearray(data), 1 << rng.randrange(8)
-            # Neither the first byte nor the last one: they delimit a frame.
-            for index in rng.sample(range(1, len(data) - 1), 2):
-                damaged[index] ^= bit
-            first = [(delay, bytes(damaged))]
+            first = [(delay, self.twin(data, rng))]
         elif kind != "lose":
             other = value if isinstance(value, bytes) else b"\x00\xff"
             first = [(delay, other if kind == "replace" else other + data)]

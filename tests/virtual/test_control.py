@@ -18,6 +18,7 @@ from .commands import ABL, ALL, BUS, CARS, EVBOX, EWS, SMARTEVSE
 from .control import Control
 from .device import Device
 from .evbox import EvboxChargePoint
+from .evbox_frames import checksums
 from .ews_box import EwsBox
 from .ews_frames import command
 from .smartevse import SmartEvse
@@ -238,6 +239,29 @@ def test_twin_errors_fit_the_checksum(ews: Desk) -> None:
     different = [a ^ b for a, b in zip(good, damaged, strict=True) if a != b]
     assert len(different) == 2
     assert different[0] == different[1]
+
+
+def test_twin_errors_of_an_abl_box_fit_its_lrc(abl: Desk) -> None:
+    good = abl.client.ask(READ_FULL)
+    for _ in range(20):
+        abl.do("twin-error 1")
+        damaged = abl.client.ask(READ_FULL)
+        data = bytes.fromhex(damaged[1:-2].decode())
+        assert sum(data) & 0xFF == 0
+        assert damaged != good
+        assert damaged[:7] == good[:7]
+
+
+def test_twin_errors_of_a_chargepoint_fit_both_its_checksums(evbox: Desk) -> None:
+    good = ask(evbox)
+    for _ in range(20):
+        evbox.do("twin-error 7")
+        damaged = ask(evbox)
+        text, sums = damaged[1:-5].decode(), damaged[-5:-1].decode()
+        assert checksums(text) == sums
+        different = [a ^ b for a, b in zip(good, damaged, strict=True) if a != b]
+        assert len(different) == 2
+        assert different[0] == different[1]
 
 
 def test_clock_cable_and_limit_of_an_ews_box(ews: Desk) -> None:
