@@ -209,7 +209,7 @@ class SmartEvseController:
             "solar_timer": out.solar_timer,
             "config_changed": self.config_changed,
             "phases": out.phases,
-            "temperature": out.temperature + KELVIN,
+            "temperature": out.temperature_measured + KELVIN,
             "serial": self.serial,
             "ev_meter_now": out.settings.get("ev_meter", 0),
             "ev_address_now": out.settings.get("ev_address", 0),

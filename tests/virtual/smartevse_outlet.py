@@ -66,6 +66,7 @@ class SmartEvseOutlet(SmartEvseStates):
     # Every second
 
     def _every_second(self, now: float) -> None:
+        self.temperature_measured = self.temperature
         if self.state == "B" and 0 < self._activation < NEVER:
             self._activation -= 1
         if self.state == "T":

@@ -91,6 +91,7 @@ class SmartEvseStates:
         self.cycles = 0
         self._now: float | None = None
         self.power_up()
+        self.temperature_measured = self.temperature
 
     def power_up(self) -> None:
         """Begin with the stored settings: all volatile state is lost."""
@@ -103,6 +104,8 @@ class SmartEvseStates:
         self.contactor = False
         self.pilot_current = 0.0
         self.cable_measured = 0
+        # For a second after a power cycle (2.30 and HEAD, `power_cycle`).
+        self.temperature_measured = 0
         self.phases = 0
         self.override = 0
         self.current = 0
@@ -221,6 +224,8 @@ class SmartEvseStates:
         if state == "A":
             self.error &= ~(NO_SUN | LESS_6A)
             self.charge_delay = 0
+            # HEAD, `next_car`.
+            self.phases = 0
         elif state == "B1":
             self.charge_delay = self.charge_delay or B1_DELAY
         elif state == "C1":
