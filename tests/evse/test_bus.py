@@ -513,6 +513,42 @@ def test_no_silence_no_speech() -> None:
     simulate(scene())
 
 
+def test_a_reading_gets_no_older_on_a_line_that_is_never_quiet() -> None:
+    """No reply is missed, since nothing can be sent; but nothing is known either."""
+
+    async def scene() -> None:
+        bus = Scene(interval=1.0)
+        bus.bus.wire.timing = type(TIMING)(
+            reply_timeout=0.25, longest_reply=40, silence=0.1, silence_patience=1.0
+        )
+        async with bus:
+            await asyncio.sleep(5)
+            charger = bus.charger(1)
+            assert charger.available
+
+            async def chatter() -> None:
+                while True:
+                    bus.line.hear(b"@\x63R\x01")
+                    await asyncio.sleep(0.05)
+
+            talking = asyncio.create_task(chatter())
+            await asyncio.sleep(20)
+            assert charger.available
+            await asyncio.sleep(20)
+            assert not charger.available
+            assert charger.reading is None
+            talking.cancel()
+            await asyncio.sleep(5)
+            assert charger.available
+            # It is counted anew from here.
+            talking = asyncio.create_task(chatter())
+            await asyncio.sleep(20)
+            assert charger.available
+            talking.cancel()
+
+    simulate(scene())
+
+
 def test_chargers_come_and_go_without_disturbing_the_others() -> None:
     async def scene() -> None:
         async with Scene(addresses=(1, 2, 3), interval=1.0) as bus:

@@ -458,6 +458,7 @@ class Bus(Observable):
         now = self.now
         patience = self.wire.timing.silence_patience
         charger.slot.ready = now + max(patience, charger.minimum_pause(now))
+        charger.on_prevented(now, str(error))
 
     def _follow_up(
         self,

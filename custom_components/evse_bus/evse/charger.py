@@ -20,7 +20,7 @@ from dataclasses import replace
 from functools import partial
 import logging
 from math import inf
-from typing import ClassVar, Protocol, override
+from typing import ClassVar, Final, Protocol, override
 
 from .conversation import Conversation, FollowUp, nothing
 from .errors import NotAvailableError
@@ -62,6 +62,10 @@ from .statistics import ChargerStatistics
 from .throttle import PresenceLog
 
 _LOGGER = logging.getLogger(__name__)
+
+PREVENTED: Final = 30.0
+"""Time for which a line may prevent all polls of a charger before its reading is too
+old, s."""
 
 
 class Scheduler(Protocol):
@@ -123,6 +127,8 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         self.available = False
         """It answers, and its reading is up to date."""
         self._presence = PresenceLog()
+        self._prevented_since = inf
+        """Loop time of the first poll since its last reply that the line prevented."""
         self._pause_watch = PauseWatch()
         self.noticed: frozenset[Fault] = frozenset()
         """Faults found by this library, beside those the charger reports."""
@@ -373,6 +379,7 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
     def on_reply(self, now: float) -> None:
         """Take note of a good reply; the charger is available."""
         self.misses = 0
+        self._prevented_since = inf
         self.slot.kind = Kind.POLL
         self.slot.served = now
         if not self.available:
@@ -395,6 +402,15 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
             pause = min(self.timing.backoff * doubled, self.timing.backoff_limit)
             self.set_unavailable(why)
         self.slot.ready = self.slot.due = now + max(pause, self.minimum_pause(now))
+
+    def on_prevented(self, now: float, why: str) -> None:
+        """Take note of a poll that the line has prevented: that is no missed reply.
+
+        Where it goes on, the reading is dropped all the same. ``why``: for the log.
+        """
+        self._prevented_since = min(self._prevented_since, now)
+        if self.available and now - self._prevented_since >= PREVENTED:
+            self.set_unavailable(why)
 
     def is_wrong(self, found: str | None, expected: str | None) -> bool:
         """Return whether a serial number is that of another box than this one."""
