@@ -8,7 +8,8 @@ import pytest
 
 from custom_components.evse_bus.evse.errors import LineBusyError, RefusedOrderError
 from custom_components.evse_bus.evse.evbox import PROTOCOL, EvboxConfig
-from custom_components.evse_bus.evse.evbox.scan import PROBES
+from custom_components.evse_bus.evse.evbox.memory import EvboxMemory
+from custom_components.evse_bus.evse.evbox.scan import LONGEST_WAIT, PROBES
 from custom_components.evse_bus.evse.model import CurrentLimit, Orders
 from custom_components.evse_bus.evse.scan import ScanResult
 from tests.simulated_time import now, simulate
@@ -122,6 +123,20 @@ def test_a_number_that_is_not_confirmed_is_not_bound(
                 assert (one.address, one.serial) == (0, None)
             else:
                 assert (one.address, one.serial) == (1923054, "1923054")
+
+    simulate(scene())
+
+
+def test_one_damaged_interval_does_not_hold_up_the_next_search() -> None:
+    async def scene() -> None:
+        async with Scene.of(EvboxChargePoint(1923054)) as stage:
+            await find(stage)
+            interval = stage.line.memory.of(EvboxMemory).interval(0)
+            interval.update(599)
+            started = now()
+            report, _ = await find(stage)
+            assert [one.address for one in report.found] == [1923054]
+            assert now() - started < LONGEST_WAIT + 5
 
     simulate(scene())
 

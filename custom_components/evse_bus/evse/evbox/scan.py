@@ -131,7 +131,9 @@ def _pause(memory: EvboxMemory, config: EvboxConfig) -> float:
     interval = memory.interval(config.addressed)
     if interval.reported is None:
         return RETRY_PAUSE
-    return max(interval.value, interval.reported) + INTERVAL_MARGIN
+    # One that no other reply has confirmed may be damaged: up to 10 min.
+    unconfirmed = min(interval.reported, LONGEST_WAIT)
+    return max(interval.value, unconfirmed) + INTERVAL_MARGIN
 
 
 async def _wait(memory: EvboxMemory, config: EvboxConfig, progress: Progress) -> None:
