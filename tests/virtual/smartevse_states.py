@@ -164,6 +164,11 @@ class SmartEvseStates:
         holds = car.requesting and car.requests_without_pwm and self._offered
         return CHARGING if holds or car.current > 0 else CONNECTED
 
+    @property
+    def measuring_cable(self) -> bool:
+        """Return whether it is about to enter B: a frame waits until it has."""
+        return self._next == "B" and self.state in ("A", "B1")
+
     def open_access(self) -> None:
         """Open access unless a switch decides; done whenever settings are stored."""
         if self.settings["switch"] not in (1, 2):
