@@ -12,7 +12,7 @@ from tests.simulated_time import now
 from tests.virtual import AblBox, Car, Request
 from tests.virtual.abl_outlet import Outlet
 
-from .scene import LIMIT, Scene, answers, config, orders, until
+from .scene import LIMIT, SERIAL, Scene, answers, config, orders, until
 
 
 def plugged(**settings: float) -> Car:
@@ -240,6 +240,31 @@ async def test_a_serial_number_typed_in_later_is_checked_before_the_next_write()
             await charger.change_orders(OrderChange(current=8))
         assert scene.writes() == []
         assert Fault.WRONG_CHARGER in charger.faults
+
+
+@pytest.mark.parametrize("lost", [2, 1_000_000])
+async def test_lost_replies_are_no_box_without_a_serial_number(lost: int) -> None:
+    """It has another master, which only its serial number shows."""
+    box = AblBox(1)
+    read, left = box._read, lost
+
+    def loses(request: Request) -> bytes | None:
+        nonlocal left
+        if request.register != SERIAL or left == 0:
+            return read(request)
+        left -= 1
+        return None
+
+    box._read = loses  # type: ignore[method-assign]
+    async with Scene(box) as scene:
+        charger = scene.add(config(), orders(6))
+        charger.accepts = lambda _serial: False
+        if lost == 2:
+            await until(lambda: Fault.WRONG_CHARGER in charger.faults)
+            assert scene.writes() == []
+        else:
+            await until(lambda: charger.available and charger.info is not None)
+            assert charger.serial is None
 
 
 async def test_a_box_replaced_while_the_adapter_was_away() -> None:

@@ -59,6 +59,8 @@ from .registers import (
 )
 from .states import E0
 
+SERIAL_PROBES: Final = 2
+"""Identifications in which 0x0050 is silent that prove its absence."""
 SURPLUS_REPLIES: Final = 3
 """Replies that belong to no request, within `SURPLUS_TIME`, that suggest a second box;
 a damaged reply or one too many does not."""
@@ -124,6 +126,8 @@ class AblReader(Charger[AblConfig]):
         self._flags: Flags | None = None
         self._check = StatusCheck()
         self._identified = False
+        self._serial_silent = 0
+        """Identifications without a reply to the reads of the serial number."""
         self._surplus: deque[float] = deque(maxlen=SURPLUS_REPLIES)
         """Loop times of the last replies that belong to no request, s."""
         self._doubted = False
@@ -277,10 +281,16 @@ class AblReader(Charger[AblConfig]):
             serial = await read(turn, self.config.address, SERIAL, attempts=2)
         except GarbledReplyError:
             raise
-        except ReplyTimeoutError, ExchangeRefusedError:
+        except (ReplyTimeoutError, ExchangeRefusedError) as error:
             if self.config.serial is not None or self._serial is not None:
                 raise
+            self._serial_silent += isinstance(error, ReplyTimeoutError)
+            if 0 < self._serial_silent < SERIAL_PROBES:
+                # Replies may be lost: without its number a box of another master
+                # would be taken for one of its own.
+                raise
             return None
+        self._serial_silent = 0
         known = None if expected is None else Serial(number=expected)
         agreed = await self._read_agreed(turn, SERIAL, known, first=serial)
         return agreed.number
