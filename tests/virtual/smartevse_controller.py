@@ -17,6 +17,7 @@ from .smartevse_frames import (
     decode,
     exception_frame,
     frame,
+    read_frame,
     values_frame,
     words,
     write_frame,
@@ -102,6 +103,10 @@ class SmartEvseController:
             self.requests_sent.append(Handshake(now, register, value))
             self._say_request(write_frame(self.unit, register, value))
         out.asked.clear()
+        for unit in out.polls_due:
+            register, count = self.dialect.polled or (0, 0)
+            self._say_request(read_frame(unit, register, count))
+        out.polls_due.clear()
         error_register = self.dialect.register_of("error")
         for bits in out.error_broadcasts:
             register = error_register if self.dialect.status_writable else 2

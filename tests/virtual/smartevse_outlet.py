@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from .smartevse_registers import (
     LESS_6A,
+    MASTER,
     NO_COMM,
     NO_CURRENT,
     NO_SUN,
@@ -21,6 +22,8 @@ COMM_TIMEOUT = 10
 TOO_HOT, COOL_AGAIN = 65, 55
 # The later dialects poll their nodes before they calculate.
 POLLING = 0.1
+# As a master: between the polls, and from the last to the broadcast (`master`).
+POLL_SPACING, POLL_TO_BROADCAST = 0.109, 0.129
 
 
 class SmartEvseOutlet(SmartEvseStates):
@@ -52,6 +55,8 @@ class SmartEvseOutlet(SmartEvseStates):
             if self.state != "A":
                 self.stop()
         self._follow_pilot(now)
+        while self._polls and now >= self._polls[0][0]:
+            self.polls_due.append(self._polls.pop(0)[1])
         if self._cycle_at is not None and now >= self._cycle_at:
             self._cycle_at = None
             self.calculate()
@@ -129,6 +134,10 @@ class SmartEvseOutlet(SmartEvseStates):
             return
         self.comm_timeout = COMM_TIMEOUT
         self._cycle_at = now + (POLLING if self.dialect.status_writable else 0.0)
+        if self.load_balance == MASTER and self.dialect.polled:
+            nodes = range(MASTER + 1, self.dialect.units + 1)
+            self._polls = [(now + POLL_SPACING * n, u) for n, u in enumerate(nodes)]
+            self._cycle_at = self._polls[-1][0] + POLL_TO_BROADCAST
 
     def calculate(self) -> None:
         """Set current and PWM: its own cycle."""

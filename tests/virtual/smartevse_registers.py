@@ -55,7 +55,7 @@ class Dialect:
     another master stop its own cycle; `reports_cable`: its maximum is that of the cable
     alone; `measures`: it searches for the smallest current of each car first, and
     ignores the override meanwhile; `balance_register`: for the charge currents that
-    a master broadcasts; `silent`: write-only registers without a reply.
+    a master broadcasts; `polled`: the registers that it reads at its nodes; `silent`: write-only registers without a reply.
     """
 
     name: str
@@ -72,6 +72,7 @@ class Dialect:
     status_writable: bool = True
     reports_cable: bool = False
     measures: bool = False
+    polled: tuple[int, int] | None = None
 
     def find(self, register: int, count: int) -> tuple[str | Setting, ...] | None:
         """Return the items of these registers, or None for an unmapped one."""
@@ -258,6 +259,7 @@ V2_20 = Dialect(
         ),
     ),
     silent=frozenset({0x01}),
+    polled=(0xA0, 11),
 )
 
 _STATUS_LATER = Block(
@@ -345,6 +347,7 @@ V2_30 = Dialect(
     ),
     silent=frozenset(),
     external_master=True,
+    polled=(0x0000, 8),
     reports_cable=True,
 )
 
@@ -370,6 +373,7 @@ HEAD = Dialect(
     silent=frozenset(),
     gentle=True,
     external_master=True,
+    polled=(0x0000, 8),
     measures=True,
 )
 

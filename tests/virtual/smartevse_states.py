@@ -88,6 +88,8 @@ class SmartEvseStates:
         # (register, value) to send: a slave's requests, to its own address.
         self.asked: list[tuple[int, int]] = []
         self.error_broadcasts: list[int] = []
+        # As a master of a later dialect: nodes to poll now.
+        self.polls_due: list[int] = []
         self.cycles = 0
         self._now: float | None = None
         self.power_up()
@@ -121,6 +123,7 @@ class SmartEvseStates:
         self._asked_at = float("-inf")
         self._second_at: float | None = None
         self._cycle_at: float | None = None
+        self._polls: list[tuple[float, int]] = []
         self._c1_timer = 0
         self._measured_from: float | None = None
         self._activation = NEVER
