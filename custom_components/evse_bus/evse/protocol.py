@@ -170,6 +170,10 @@ class Protocol[C: ChargerConfig = Any]:
             group = self.group()
         timing, wanted = self.timing, line.settings.reply_timeout
         if wanted is not None:
+            # A box may take the protocol's own time; a master's broadcasts cannot wait.
+            wanted = max(wanted, timing.reply_timeout)
+            if self.master is not None:
+                wanted = min(wanted, timing.reply_timeout_limit)
             timing = replace(timing, reply_timeout=wanted, reply_timeout_limit=wanted)
         return Bus(line, self.framer(), timing, name, group=group)
 

@@ -258,9 +258,18 @@ class EwsBox:
     ) -> None:
         """Send a command that is confirmed by one byte; return when it was OK.
 
-        Raises EwsRefusedError, and what `read` raises.
+        Where a reply was lost since the box was identified, perhaps by its other port,
+        nothing is sent. Raises ReplyTimeoutError then, EwsRefusedError, and what `read`
+        raises.
         """
-        await self.exchange(turn, command, make, confirmed(command))
+
+        def request() -> Request:
+            if not self._identified:
+                message = "the box has to be identified again: nothing was sent"
+                raise ReplyTimeoutError(message)
+            return make()
+
+        await self.exchange(turn, command, request, confirmed(command))
 
     async def exchange[T](
         self,

@@ -214,6 +214,16 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
     def on_line_open(self) -> None:
         super().on_line_open()
         self._written = None
+        if self._serial is None:
+            # Another box may be in its place, whose access somebody else has turned off.
+            self._paused_for_limit = False
+
+    @override
+    def on_line_reopened(self) -> None:
+        # Between two polls of a box that answers nothing has taken its place.
+        paused = self._paused_for_limit and not self.misses
+        super().on_line_reopened()
+        self._paused_for_limit |= paused
 
     @override
     def on_missed(self, now: float, why: str) -> None:

@@ -112,8 +112,6 @@ class TimeZone(IntEnum):
     """"MEZ (Deutschland)"; the manual does not mention summer time."""
 
 
-GERMAN: Final = 0
-"""The only language with a number in the manual."""
 SOURCE_PORTS: Final = 10
 """The box dials from so many TCP ports, one after the other."""
 
