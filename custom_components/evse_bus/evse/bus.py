@@ -73,6 +73,9 @@ class Bus(Observable):
         self.master = group if isinstance(group, BusMaster) else None
         self._jobs = JobQueue()
         self._task: asyncio.Task[None] | None = None
+        self.stop_patience = STOP_PATIENCE
+        """Longest time a stop waits for a conversation begun, s; one that must not be
+        left half done raises it meanwhile."""
         self._stopping = False
         self._timer = WakeTimer()
         self.port = Port(self.wire, name or line.url, self._timer)
@@ -132,7 +135,7 @@ class Bus(Observable):
         self._jobs.fail_all(stopped, begun=False)
         if self._task is not None:
             self.reschedule()
-            done, _ = await asyncio.wait({self._task}, timeout=STOP_PATIENCE)
+            done, _ = await asyncio.wait({self._task}, timeout=self.stop_patience)
             if not done:
                 self._task.cancel()
                 with suppress(asyncio.CancelledError):

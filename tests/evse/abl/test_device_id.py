@@ -469,8 +469,11 @@ async def test_a_caller_that_gives_up_in_the_middle() -> None:
 
 
 @pytest.mark.parametrize("value", [E2, 0xF002])
-async def test_a_bus_that_stops_in_the_middle_still_resets_the_box(value: int) -> None:
-    one = box()
+@pytest.mark.parametrize("round_trip", [0.002, 0.4, 1.2])
+async def test_a_bus_that_stops_in_the_middle_still_resets_the_box(
+    value: int, round_trip: float
+) -> None:
+    one = box(turn_round=round_trip)
     async with Scene(one) as scene:
         changing = asyncio.create_task(change(scene))
         await until(lambda: value in written(one), LONG)

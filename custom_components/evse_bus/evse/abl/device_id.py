@@ -22,7 +22,7 @@ from ..address_change import (
     AddressChangeError,
     Problem,
 )
-from ..bus import Bus
+from ..bus import STOP_PATIENCE, Bus
 from ..conversation import rest
 from ..errors import (
     EvseError,
@@ -85,6 +85,8 @@ STATE_READS: Final = 4
 """Requests until a state counts as not readable."""
 BOOT_PATIENCE: Final = 20.0
 """Longest time from the reset until the box is found, s."""
+UNFINISHED_PATIENCE: Final = 60.0
+"""Longest time a stop of the bus waits for a change that has begun, s."""
 LONGEST_TURN: Final = 3
 """Exchanges of one turn: state, serial number, write."""
 
@@ -207,6 +209,7 @@ class DeviceIdChange:
         finally:
             # Also when the bus ends it, whether or not its caller still waits.
             _CHANGING.discard(self._bus)
+            self._bus.stop_patience = STOP_PATIENCE
 
     async def _run(self, turn: Turn) -> AddressChanged:
         if await self._is_at_new_already(turn):
@@ -454,6 +457,8 @@ class DeviceIdChange:
     def _begin(self, stage: _Stage) -> None:
         """Enter a stage; note how the charger leaves E2 if that ends too early."""
         self.stage = stage
+        # A box left in E2 lets no car charge: behind a slow adapter the way out takes long.
+        self._bus.stop_patience = UNFINISHED_PATIENCE
         if self._own is None:
             return
         # An order that comes meanwhile must not be sent to another box there.
