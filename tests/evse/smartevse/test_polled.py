@@ -1,6 +1,7 @@
 """A polled SmartEVSE in all dialects: orders, readings, and their checks."""
 
 import asyncio
+from dataclasses import replace
 
 import pytest
 
@@ -182,6 +183,24 @@ def test_after_off_and_on_a_car_that_keeps_its_request_is_not_gone(
         await scene.until(lambda: scene.connector.plugged is False)
 
     play(PolledScene(dialect), acts)
+
+
+@pytest.mark.parametrize("waiting", ["E", "F"])
+def test_a_request_that_its_master_did_not_answer_is_no_unplugged_car(
+    waiting: str,
+) -> None:
+    """It goes back to A, with the car in, and asks again."""
+
+    async def acts(scene: PolledScene) -> None:
+        await asyncio.sleep(20)
+        assert scene.connector.plugged is False
+        status = scene.charger.status
+        assert status is not None
+        for state in (waiting, "A"):
+            scene.charger.on_status(replace(status, raw_state=state), now())
+        assert scene.connector.plugged is None
+
+    play(PolledScene(V2_17), acts)
 
 
 @each

@@ -48,7 +48,7 @@ from .registers import (
     write_access,
     write_answer,
 )
-from .states import CHARGING, UNPLUGGED, is_stopped, shows_plug
+from .states import CHARGING, UNPLUGGED, WAITING, is_stopped, shows_plug
 
 TIMING: Final = Timing(
     # More than 3 ms of silence end a frame, and a box replies after more than 6 ms.
@@ -314,9 +314,13 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
             hidden = HIDDEN_BY_ERROR if status.access else inf
         elif status.raw_state != UNPLUGGED:
             self._plug_hidden_until = 0.0
-        elif before is None or (before.maximum is not None and status.maximum is None):
+        elif (
+            before is None
+            or before.raw_state in WAITING
+            or (before.maximum is not None and status.maximum is None)
+        ):
             # Perhaps it was just switched on, or cleared NO_COMM: it knows of no cable,
-            # or was out of sight.
+            # or was out of sight. Or its master was late, and it asks again.
             hidden = HIDDEN_BY_START
         self._plug_hidden_until = max(self._plug_hidden_until, now + hidden)
 

@@ -15,6 +15,8 @@ from .dialects import MAPS, Dialect, Status
 UNPLUGGED: Final = "A"
 CHARGING: Final = frozenset({"C", "D"})
 """The contactor is closed."""
+WAITING: Final = frozenset("EFGH")
+"""It waits for its master's answer."""
 STOPPING: Final = "C1"
 """No current is offered; the contactor opens within 6 s."""
 
