@@ -20,7 +20,7 @@ from custom_components.evse_bus.evse.model import (
     Status,
 )
 from custom_components.evse_bus.evse.smartevse import POLLED
-from custom_components.evse_bus.evse.smartevse.dialects import Dialect
+from custom_components.evse_bus.evse.smartevse.dialects import MAPS, Dialect
 from tests.simulated_time import now, simulate
 
 from .polled_scene import (
@@ -181,6 +181,24 @@ def test_after_off_and_on_a_car_that_keeps_its_request_is_not_gone(
         await scene.until(lambda: scene.connector.plugged is True)
         scene.outlet.pilot_voltage = 12
         await scene.until(lambda: scene.connector.plugged is False)
+
+    play(PolledScene(dialect), acts)
+
+
+@each
+def test_without_a_measured_cable_6_a_are_written(dialect: Dialect) -> None:
+    """A plugged car, and a box that reports 0 for its cable: no more is known to fit."""
+
+    async def acts(scene: PolledScene) -> None:
+        await scene.charge()
+        await scene.polled(3)
+        assert scene.box.offers == 10
+        since = now()
+        scene.outlet.cable_measured = 0
+        await scene.until(lambda: scene.box.offers == 6, 60)
+        current = MAPS[dialect].current_register
+        written = [one for one in scene.writes(since=since) if one.register == current]
+        assert {one.value for one in written} == {60}
 
     play(PolledScene(dialect), acts)
 

@@ -215,8 +215,6 @@ class Map:
     """In the EEPROM of the box."""
     faults: Mapping[int, Fault] = field(default_factory=lambda: FAULTS)
     """By bit of the error register."""
-    standard_exceptions: bool = False
-    """Its exceptions have 0x80 in the function."""
     needs_quiet: bool = False
     """A request on the line, to any address, suspends its own cycle."""
     search_time: float = 0.0
@@ -297,7 +295,6 @@ _VERSION_3: Final = replace(
     # As a node it has no cycle of its own, but one that is polled may need the quiet.
     # With an ESP32 it answers as a node only.
     faults=_FAULTS_3,
-    standard_exceptions=True,
     shows_plug=True,
 )
 

@@ -380,14 +380,14 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
     def _override_for(self, status: Status, setpoint: Setpoint) -> Setpoint | None:
         """Return the override for a status; ``None``: no current is allowed.
 
-        The cable of the next car is unknown before it is plugged in, and the override
-        takes precedence over the box's own knowledge of it: 6 A until then.
+        The cable of the next car is unknown before it is plugged in and measured, and
+        the override takes precedence over the box's own knowledge of it: 6 A until then.
         """
         dialect = self.known_dialect
         plugged = (
             shows_plug(dialect, status) and state_of(dialect, status.raw_state).plugged
         )
-        if plugged and not setpoint.paused:
+        if plugged and status.maximum is not None and not setpoint.paused:
             return setpoint
         limits = replace(self.limits, reported=MINIMUM_CURRENT, minimum=MINIMUM_CURRENT)
         lowest = clamp(_LOWEST, limits)
