@@ -223,3 +223,25 @@ def test_no_answer_is_sent_too_late() -> None:
             assert len(answers(scene, asked)) == 1
 
     simulate(scene())
+
+
+@pytest.mark.parametrize("before", [0.46, 0.47, 0.48, 0.49, 0.5, 1.0])
+def test_a_request_after_access_was_allowed_is_answered_at_once(before: float) -> None:
+    """A box asks 0.1 s after the write; its read-back may wait for a broadcast."""
+
+    async def scene() -> None:
+        async with MasterScene(units=(2,)) as scene:
+            await asyncio.sleep(6)
+            slave, box = scene.slave(2), scene.box(2)
+            await slave.change_orders(OrderChange(allowed=False))
+            box.car.plug_in()
+            await asyncio.sleep(6)
+            await asyncio.sleep(scene.master.slot.ready + PERIOD - before - now())
+            await slave.change_orders(OrderChange(allowed=True))
+            await scene.until(lambda: box.state == "C")
+            asked = box.controller.requests_sent
+            assert [one.register for one in asked] == [2, 3]
+            for one, answer in zip(asked, box.controller.answers, strict=True):
+                assert answer.t - one.t < 0.8
+
+    simulate(scene())

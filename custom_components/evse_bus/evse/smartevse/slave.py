@@ -443,13 +443,11 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
             # A box that was not read is not answered.
             self.read_soon(now)
             return FollowUp(nothing)
+        reads_first = False
         if request.kind in _FOR_CURRENT:
             self._own_maximum = request.wanted
-            if self.may_begin and self._has_no_access:
-                # Access was turned on at the box since, or off after the request: read
-                # first. It asks again in a second.
-                self.read_soon(now)
-                return FollowUp(nothing)
+            # Its access was turned on since its last status, or off after the request.
+            reads_first = self.may_begin and self._has_no_access
         else:
             # The others need not wait for what it leaves.
             self._reserved_until = -inf
@@ -458,9 +456,25 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
             return FollowUp(nothing)
         answer_by = now + ANSWER_WITHIN
         self._answering[request.kind] = answer_by
+        if reads_first:
+            return FollowUp(partial(self._read_and_answer, request, answer_by))
         return FollowUp(
             partial(self._answer, request, answer_by), worst_case=self._answer_time
         )
+
+    async def _read_and_answer(
+        self, request: SlaveRequest, answer_by: float, turn: Turn
+    ) -> None:
+        """Answer a request if the box has access: a conversation."""
+        try:
+            await self.read_status_once(turn)
+        finally:
+            if self._has_no_access or self.status is None:
+                # It asks again in a second.
+                self._answering.pop(request.kind, None)
+        if not self._has_no_access:
+            await rest(worst_case=self._answer_time)
+            await self._answer(request, answer_by, turn)
 
     async def _answer(
         self, request: SlaveRequest, answer_by: float, turn: Turn
