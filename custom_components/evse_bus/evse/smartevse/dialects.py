@@ -13,6 +13,7 @@ from other contents (the state of 2.17 and 2.20, a minimum, a setting) is requir
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from math import inf
 from typing import Final, override
 
 from ..fields import Choice, Flag, Number, Numeric, Scaled, known
@@ -150,12 +151,16 @@ class _Celsius(Numeric[int | None]):
         raise self.refused("cannot be written")
 
 
-def _status_a0(states: Mapping[int, str]) -> Registers[Status]:
-    """Return the status block of 2.17 and 2.20, which differ in the state only."""
+def _status_a0(states: Mapping[int, str], words: int = 9) -> Registers[Status]:
+    """Return the status block of 2.17 and 2.20, which differ in the state only.
+
+    ``words``: its length; the meter address and the solar timer, at the end of a
+    longer one, are not used.
+    """
     return Registers(
         Status,
         "README of v2, 0x00A*",
-        PROBE_A0,
+        _read(0xA0, words),
         {
             "raw_state": Word(0xA0, Choice(values=states)),
             "error": Word(0xA1, _ERROR),
@@ -169,23 +174,24 @@ def _status_a0(states: Mapping[int, str]) -> Registers[Status]:
 
 
 def _status_0000(
-    temperature: Numeric[int | None], access: Numeric[bool | None]
+    temperature: Numeric[int | None], access: Numeric[bool | None], words: int = 12
 ) -> Registers[Status]:
-    """Return the status block of 2.30 and later."""
+    """Return the status block of 2.30 and later, or so many words of it."""
+    table: dict[str, Word[Numeric[object]]] = {
+        "raw_state": Word(0x0000, _StateName(names=_LATER_STATES)),
+        "error": Word(0x0001, _ERROR),
+        "current": Word(0x0002, _CURRENT),
+        "mode": Word(0x0003, _MODE),
+        "access": Word(0x0005, access),
+        "maximum": Word(0x0007, _MAXIMUM),
+        "temperature": Word(0x000A, temperature),
+        "serial": Word(0x000B, _SERIAL),
+    }
     return Registers(
         Status,
         "README of later versions, 0x0000",
-        _read(0x0000, 12),
-        {
-            "raw_state": Word(0x0000, _StateName(names=_LATER_STATES)),
-            "error": Word(0x0001, _ERROR),
-            "current": Word(0x0002, _CURRENT),
-            "mode": Word(0x0003, _MODE),
-            "access": Word(0x0005, access),
-            "maximum": Word(0x0007, _MAXIMUM),
-            "temperature": Word(0x000A, temperature),
-            "serial": Word(0x000B, _SERIAL),
-        },
+        _read(0x0000, words),
+        {name: word for name, word in table.items() if word.register < words},
     )
 
 
@@ -197,6 +203,70 @@ def _minutes(lowest: int, highest: int) -> Number:
     return Number(unit="min", possible=range(lowest, highest + 1))
 
 
+# -- Load balancing ----------------------------------------------------------------
+
+
+class Family(StrEnum):
+    """The dialects that one broadcast of currents is for.
+
+    One master has boxes of one family: the broadcast of 2.20 covers error, mode and
+    access of a later box.
+    """
+
+    V2_17 = "2.17"
+    V2_20 = "2.20"
+    LATER = "2.30"
+    """2.30, what came after it, and 3.x."""
+
+
+class Handshake(StrEnum):
+    """How a box that wants current asks its master for it."""
+
+    REQUESTS = "requests"
+    """It writes to its master (`balancing.SlaveRequest`)."""
+    POLLED = "polled"
+    """It waits in a state (4 for B, 6 for C) until the master has read that."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Balancing:
+    """The habits of a dialect as a node of a load-balancing master.
+
+    Source: sections ``node*``, ``two_nodes`` and ``makers_master`` of the recorded
+    firmwares; for 3.x its source as read. PROTOCOLS.md, 3.
+    """
+
+    family: Family
+    units: range
+    """Addresses of its nodes."""
+    broadcast_unit: int
+    broadcast_register: int
+    currents: int
+    """Values of a broadcast, for units 1, 2 and so on."""
+    all_stop_register: int | None
+    """Error bits for all nodes, at the broadcast unit; ``None``: not known."""
+    handshake: Handshake
+    status: Registers[Status]
+    """The block that its master polls; a longer one (`Map.status`) has more."""
+    zero_stops: bool
+    """A 0 in the broadcast opens its contactor; else it offers 6 A then."""
+    opens_within: float
+    """Longest time from a stop that it has received to an open contactor, s."""
+    asks_again_after: float
+    """Time from a 0 in the broadcast to its next request, s; with `zero_stops` only."""
+    stops_after: float
+    """Longest time without a broadcast after which no current flows, s; inf: it may go
+    on for ever."""
+    access_is_volatile: bool
+    """Access is on again after a power failure. Else it is in the flash memory, and
+    not written for a pause."""
+
+    @property
+    def fail_safe_proven(self) -> bool:
+        """Return whether it is known to stop without a broadcast."""
+        return self.stops_after < inf
+
+
 # -- Dialects ----------------------------------------------------------------------
 
 
@@ -205,6 +275,7 @@ class Map:
     """The registers of a dialect."""
 
     status: Registers[Status]
+    balancing: Balancing
     socket: Word[Flag]
     """0 socket, 1 fixed cable."""
     load_balancing: Word[Number]
@@ -262,13 +333,53 @@ PROBE_V3_OLD: Final = _read(0x0216, 1)
 """Refused by 3.x with a block 0x0200 of 22 words, answered by those with 26."""
 
 
-def _later(status: Registers[Status], *, start: Number, imported: Number) -> Map:
+_NODE: Final = Balancing(
+    family=Family.LATER,
+    units=range(2, 9),
+    broadcast_unit=9,
+    broadcast_register=0x0020,
+    currents=8,
+    all_stop_register=0x0001,
+    handshake=Handshake.POLLED,
+    status=_status_0000(_KELVIN, _ACCESS, words=8),
+    zero_stops=True,
+    # Seen after 0.4 s, the time of the recorded car.
+    opens_within=3.0,
+    asks_again_after=0.0,
+    # Seen after 8.8 to 9.2 s.
+    stops_after=12.0,
+    access_is_volatile=True,
+)
+_GENTLE_NODE: Final = replace(
+    # C1 holds the contactor for 6 s at most.
+    _NODE,
+    opens_within=9.0,
+    asks_again_after=16.0,
+    stops_after=18.0,
+)
+_NODE_3: Final = replace(
+    _GENTLE_NODE,
+    status=_status_0000(_KELVIN, _ACCESS_3, words=8),
+    all_stop_register=None,
+    asks_again_after=15.0,
+    access_is_volatile=False,
+)
+
+
+def _later(
+    status: Registers[Status],
+    balancing: Balancing,
+    *,
+    start: Number,
+    imported: Number,
+) -> Map:
     """Return the row of a dialect whose status is at 0x0000.
 
     ``start``, ``imported``: the words of START and IMPORT.
     """
     return Map(
         status=status,
+        balancing=balancing,
         socket=Word(0x0100, Flag()),
         load_balancing=Word(0x0104, _BALANCING),
         configuration=(_read(0x0100, 5), _read(0x0200, 8)),
@@ -289,6 +400,7 @@ def _later(status: Registers[Status], *, start: Number, imported: Number) -> Map
 _VERSION_3: Final = replace(
     _later(
         _status_0000(_Celsius(unit="degrees C"), _ACCESS_3),
+        _NODE_3,
         start=_amperes(0, 48),
         imported=_amperes(0, 48),
     ),
@@ -303,6 +415,22 @@ MAPS: Final[Mapping[Dialect, Map]] = {
     # 0x00C* and 0x00E* are shifted against them from 0xC3 and 0xE5 on.
     Dialect.V2_17: Map(
         status=_status_a0(_LETTER_STATES),
+        balancing=Balancing(
+            family=Family.V2_17,
+            units=range(2, 5),
+            broadcast_unit=0,
+            broadcast_register=0x0001,
+            currents=4,
+            all_stop_register=0x0002,
+            handshake=Handshake.REQUESTS,
+            status=_status_a0(_LETTER_STATES),
+            zero_stops=False,
+            opens_within=3.0,
+            asks_again_after=0.0,
+            # 10 to 11 s.
+            stops_after=12.0,
+            access_is_volatile=True,
+        ),
         socket=Word(0xC0, Flag()),
         load_balancing=Word(0xC1, _BALANCING),
         configuration=(_read(0xC0, 9), _read(0xE0, 3)),
@@ -314,6 +442,13 @@ MAPS: Final[Mapping[Dialect, Map]] = {
     ),
     Dialect.V2_20: Map(
         status=_status_a0(_NUMBER_STATES),
+        balancing=replace(
+            _NODE,
+            family=Family.V2_20,
+            broadcast_register=0x0001,
+            all_stop_register=0x00A1,
+            status=_status_a0(_NUMBER_STATES, words=11),
+        ),
         socket=Word(0xC0, Flag()),
         load_balancing=Word(0xC1, _BALANCING),
         configuration=(_read(0xC0, 10), _read(0xE0, 3)),
@@ -330,12 +465,14 @@ MAPS: Final[Mapping[Dialect, Map]] = {
     ),
     Dialect.V2_30: _later(
         _status_0000(_KELVIN, _ACCESS),
+        _NODE,
         start=_amperes(1, 16),
         imported=_amperes(0, 6),
     ),
     Dialect.V2_HEAD: replace(
         _later(
             _status_0000(_KELVIN, _ACCESS),
+            _GENTLE_NODE,
             # The word less 16 is an import; ours is an export, as in 2.20.
             start=Number(unit="A", possible=range(33), offset=16, sign=-1),
             imported=Number(unit="A", possible=range(97), offset=48),
@@ -346,7 +483,8 @@ MAPS: Final[Mapping[Dialect, Map]] = {
         begins_at_0=True,
         shows_plug=True,
     ),
-    Dialect.V3_OLD: _VERSION_3,
+    # Before 3.7.4 it does not stop without a master in mode normal; which one it is cannot be read.
+    Dialect.V3_OLD: replace(_VERSION_3, balancing=replace(_NODE_3, stops_after=inf)),
     Dialect.V3: _VERSION_3,
 }
 VERSION_3: Final = frozenset({Dialect.V3_OLD, Dialect.V3})
