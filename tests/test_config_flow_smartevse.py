@@ -9,6 +9,7 @@ import pytest
 from custom_components.evse_bus.evse.protocols import PROTOCOLS
 from tests.flow import NOWHERE, Flow, charger, fields, smartevse_step
 from tests.virtual import SmartEvse, VirtualBus
+from tests.virtual.smartevse_frames import read_frame
 
 if TYPE_CHECKING:
     from homeassistant.core import HomeAssistant
@@ -116,6 +117,23 @@ async def test_line_that_nobody_answers_on(hass: HomeAssistant) -> None:
         await flow.choose("scan")
         await flow.wait()
         assert flow.step == "select"
+        flow.abort()
+
+
+async def test_line_on_which_another_device_asks(hass: HomeAssistant) -> None:
+    """As a 3.x that is disabled or master: it answers nobody, and asks its meter."""
+    with VirtualBus.in_loop(baud=9600) as bus:
+        bus.foreign_traffic(read_frame(10, 0x0000, 6, 4), every=2.0)
+        flow = await smartevse_step(hass, "polled", bus.url)
+        await flow.wait()
+        assert flow.step == "foreign_requests"
+        assert flow.result["menu_options"] == ["scan", "manual", "port"]
+        assert flow.tells("Node 1 to 7", "every 2 seconds", "MODE to Normal", bus.url)
+        bus.quiet()
+        await flow.choose("scan")
+        await flow.wait()
+        assert flow.step == "nothing_found"
+        assert flow.tells("A 3.x never answers with LOAD BAL Disabled or Master")
         flow.abort()
 
 

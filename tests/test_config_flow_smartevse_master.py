@@ -9,6 +9,7 @@ import pytest
 from custom_components.evse_bus.evse.smartevse import master
 from tests.flow import Flow, charger, fields, smartevse_step
 from tests.virtual import SmartEvse, VirtualBus, smartevse_requests_in
+from tests.virtual.smartevse_frames import read_frame
 
 if TYPE_CHECKING:
     from homeassistant.core import HomeAssistant
@@ -156,6 +157,16 @@ async def test_another_master_is_noticed_and_nothing_is_said(
         await flow.choose("scan")
         await flow.wait()
         assert flow.step == "select"
+        flow.abort()
+
+
+async def test_box_that_asks_its_meter_and_answers_nobody(hass: HomeAssistant) -> None:
+    """As a 3.x that is disabled; it is no other master, and does not yield."""
+    with VirtualBus.in_loop(baud=9600) as bus:
+        bus.foreign_traffic(read_frame(10, 0x0000, 6, 4), every=2.0)
+        flow = await searched(hass, bus)
+        assert flow.step == "foreign_requests"
+        assert flow.tells("Node 1 to 7")
         flow.abort()
 
 

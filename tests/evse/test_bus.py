@@ -359,6 +359,8 @@ def test_other_peoples_and_late_frames_are_counted_and_not_misread() -> None:
             device, charger = bus.line.devices[1], bus.charger(1)
             bus.line.hear(bytes((ord("@"), 99, ord("R"), 31)))
             assert bus.bus.wire.statistics.foreign_frames == 1
+            # No frame that only a master sends.
+            assert bus.bus.wire.statistics.foreign_requests == 0
             device.delay = 0.3  # later than the time-out
             device.value = 5
             while device.delay > 0.1:

@@ -334,3 +334,46 @@ def test_a_refusal_in_the_midst_of_an_answer_is_none() -> None:
         for frame in framer.feed(raw[index : index + 1])
     ]
     assert found == [raw]
+
+
+# -- Requests ----------------------------------------------------------------------
+
+
+@given(
+    unit=_units,
+    pdu=st.one_of(
+        st.builds(read_registers, _words, st.integers(1, 125)),
+        st.builds(read_input_registers, _words, st.integers(1, 125)),
+        st.builds(write_registers, _words, st.lists(_words, min_size=1, max_size=20)),
+    ),
+)
+def test_only_a_master_sends_it(unit: int, pdu: bytes) -> None:
+    assert _frame(rtu_frame(unit, pdu)).is_request
+
+
+@given(
+    unit=_units,
+    function=st.sampled_from((3, 4)),
+    values=st.lists(_words, min_size=1, max_size=40),
+    register=_words,
+)
+def test_a_reply_is_no_request(
+    unit: int, function: int, values: list[int], register: int
+) -> None:
+    words = b"".join(value.to_bytes(2, "big") for value in values)
+    replies = (
+        bytes((function, len(words))) + words,
+        bytes((16,)) + register.to_bytes(2, "big") + len(values).to_bytes(2, "big"),
+        bytes((function, 2)),
+        bytes((function | 0x80, 2)),
+        # Its reply is equal to it.
+        write_register(register, values[0]),
+    )
+    for reply in replies:
+        assert not _frame(rtu_frame(unit, reply)).is_request
+
+
+def _frame(raw: bytes) -> ModbusFrame:
+    return ModbusFrame(
+        raw=raw, is_reply=None, unit=raw[0], function=raw[1], data=raw[2:-2]
+    )

@@ -342,6 +342,7 @@ class Wire:
             return
         if self._is_late(frame):
             return
+        self.statistics.foreign_requests += frame.is_request
         if self.on_unsolicited(frame):
             self.statistics.unsolicited += 1
         else:

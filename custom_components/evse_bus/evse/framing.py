@@ -64,6 +64,11 @@ class Frame(ABC):
     raw: bytes
     """The bytes on the wire, delimiters and all."""
 
+    @property
+    def is_request(self) -> bool:
+        """Return whether it is surely a request: only a master sends it."""
+        return False
+
 
 class Framer[F: Frame](ABC):
     """Finds frames in a stream of bytes; keeps an incomplete one for the next call."""

@@ -54,6 +54,19 @@ class ModbusFrame(Frame):
     data: bytes
     """Contents between function and checksum."""
 
+    @property
+    @override
+    def is_request(self) -> bool:
+        if self.is_reply is not None:
+            return not self.is_reply
+        if self.function in _READS:
+            # A reply has a byte count and an even number of bytes.
+            return len(self.data) == 2 * 2
+        # The reply to a write of several registers has no values; that to a write of
+        # one register is equal to its request.
+        is_long = len(self.data) > 2 * 2
+        return self.function == WRITE_MULTIPLE_REGISTERS and is_long
+
 
 def lrc(data: bytes) -> int:
     """Return the Modbus ASCII checksum over these bytes."""

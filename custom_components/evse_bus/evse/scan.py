@@ -36,6 +36,8 @@ class ScanResult:
     """Chargers with a firmware that cannot be used in this way."""
     other_master: bool = False
     """Another master is active on this line; nothing was sent."""
+    foreign_requests: bool = False
+    """Requests of another station were received: it does not expect company."""
     gateway: bool = False
     """The adapter speaks Modbus TCP, and passes nothing on."""
     round_trip: RoundTrip | None = None

@@ -35,6 +35,8 @@ class BusStatistics:
     bad_frames: int = 0
     foreign_frames: int = 0
     """Good frames that matched no request: late, or of other masters."""
+    foreign_requests: int = 0
+    """Good frames that only another master sends, also those that were of use."""
     unsolicited: int = 0
     noise_bytes: int = 0
     missed_deadlines: int = 0

@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from os.path import realpath
 from types import MappingProxyType
@@ -52,7 +53,10 @@ type Probe = tuple[ChargerConfig, Orders]
 """Configuration and orders that a search uses; sent where every message sets limits."""
 
 _LATE_REPLIES: Final = 5.0
-"""Wait for replies to a search without any, s: the line may be slow."""
+"""Wait for replies to a search without any, s: the line may be slow.
+
+Long enough also to receive another station that sends every 2 s (a SmartEVSE that
+reads a meter)."""
 
 _ERRORS: Final[dict[type[Exception], str]] = {
     PortBusyError: "port_busy",
@@ -150,12 +154,14 @@ async def async_search(
     time-out learnt from them. Raises LineError, and what `Protocol.scan` raises.
     """
     late = bus.wire.statistics.late
+    foreign = bus.wire.statistics.foreign_requests
     result = await _async_search_once(protocol, bus, searches, progress)
     if not result.found:
         await _async_wait_for_late_replies(bus, late)
     if bus.wire.statistics.late > late and not bus.wire.round_trip.too_slow:
         result = await _async_search_once(protocol, bus, searches, progress)
-    return result
+    is_shared = bus.wire.statistics.foreign_requests > foreign
+    return replace(result, foreign_requests=is_shared)
 
 
 async def _async_wait_for_late_replies(bus: Bus, late: int) -> None:

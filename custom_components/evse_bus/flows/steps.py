@@ -150,6 +150,7 @@ class ChargerSteps[
             "select": self._new(),
             "nothing_new": result.found,
             "replies_too_late": trip is not None and trip.too_slow,
+            "foreign_requests": result.foreign_requests,
             "unreadable": result.unreadable,
         }
         return next(
@@ -182,6 +183,13 @@ class ChargerSteps[
     ) -> ResultT:
         """Report that no charger answered, and offer what to try."""
         return self._menu("nothing_found")
+
+    async def async_step_foreign_requests(
+        self,
+        user_input: dict[str, Any] | None = None,  # noqa: ARG002
+    ) -> ResultT:
+        """Report that nothing answered, but that another station sends requests."""
+        return self._menu("foreign_requests")
 
     async def async_step_modbus_tcp(
         self,
