@@ -55,6 +55,15 @@ def percentile(values: Sequence[float], share: float) -> float:
     return ordered[min(rank, len(ordered)) - 1]
 
 
+def spread(seconds: Sequence[float]) -> str:
+    """Return the least, the median and p95 of some times (s), in words."""
+    least, median = min(seconds), percentile(seconds, 0.5)
+    return (
+        f"of {len(seconds)}: min {least:.2f}, median {median:.2f},"
+        f" p95 {percentile(seconds, 0.95):.2f} s"
+    )
+
+
 def gaps(times: Iterable[float]) -> list[float]:
     """Return the times between each and the next one."""
     return [after - before for before, after in pairwise(times)]

@@ -19,7 +19,8 @@ LOW: Final = 6.0
 HIGH: Final = SMARTEVSE_LIMIT
 PAUSES: Final = (0.1, 2.1)
 """Shortest and longest time between two set-points, s: any moment of the 2 s."""
-CHARGES_WITHIN: Final = 60.0
+CHARGES_WITHIN: Final = 150.0
+"""HEAD measures for 85 s first, s."""
 
 
 @dataclass(frozen=True, slots=True)
