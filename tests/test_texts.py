@@ -27,10 +27,12 @@ from custom_components.evse_bus.evse.options import Choice, HexBytes, Quantity
 from custom_components.evse_bus.evse.protocol import Protocol
 from custom_components.evse_bus.evse.protocols import PROTOCOLS
 from custom_components.evse_bus.issues import (
+    BEGINS_ABOVE_LIMIT,
     DUPLICATE_ADDRESS,
     ENERGY_NOT_COUNTED,
     LINE_TOO_SLOW,
     LOST,
+    LOWER_MAXIMUM,
     MODBUS_TCP,
     NO_SUCH_PORT,
     NOT_STORED,
@@ -140,6 +142,8 @@ def test_issues_have_texts() -> None:
         NOT_STORED,
         REPLACED,
         REPLIES_TOO_LATE,
+        BEGINS_ABOVE_LIMIT,
+        LOWER_MAXIMUM,
         SECOND_MASTER,
         SET_UP_TWICE,
         SHARED_ADDRESS,

@@ -1,6 +1,7 @@
 """Repair issues: problems that only the user can fix; deleted once they are."""
 
 from collections.abc import Mapping, Set as AbstractSet
+from math import floor
 from typing import Final
 
 from homeassistant.config_entries import ConfigEntry
@@ -12,7 +13,7 @@ from .configuration import protocol_of
 from .const import CONF_ENTRY, CONF_SERIAL, CONF_SUBENTRY, DOMAIN
 from .evse.bus import Bus
 from .evse.load import Overload
-from .evse.model import Fault, Orders
+from .evse.model import Fault, Orders, Setting
 from .evse.round_trip import RoundTrip
 from .evse.safety import INTERVALS_PER_TIMEOUT
 from .identity import Holder, another_box_texts, holder
@@ -31,8 +32,13 @@ SET_UP_TWICE: Final = "set_up_twice"
 WRONG_CHARGER: Final = "wrong_charger"
 REPLACED: Final = "replaced"
 """Text of the same where the box may have been replaced by another."""
-_FIXABLE: Final = {WRONG_CHARGER: REPLACED}
+BEGINS_ABOVE_LIMIT: Final = "begins_above_limit"
+LOWER_MAXIMUM: Final = "lower_maximum"
+"""Text of the same where the box's own maximum can be lowered from here."""
+_FIXABLE: Final = {WRONG_CHARGER: REPLACED, BEGINS_ABOVE_LIMIT: LOWER_MAXIMUM}
 """Texts of the issues that a flow can fix."""
+_WARNINGS: Final = frozenset({BEGINS_ABOVE_LIMIT, LOWER_MAXIMUM})
+"""Texts of what does not keep anything from working."""
 DUPLICATE_ADDRESS: Final = "duplicate_address"
 SHARED_ADDRESS: Final = "shared_address"
 NO_SUCH_PORT: Final = "no_such_port"
@@ -79,7 +85,9 @@ def _create(
         is_fixable=fix is not None,
         # Found once only: it stays until the user ignores it.
         is_persistent=key == ENERGY_NOT_COUNTED,
-        severity=ir.IssueSeverity.ERROR,
+        severity=(
+            ir.IssueSeverity.WARNING if key in _WARNINGS else ir.IssueSeverity.ERROR
+        ),
         translation_key=key,
         translation_placeholders=placeholders,
     )
@@ -230,6 +238,7 @@ class BusIssues:
             )
         self._check_firmware(managed, texts)
         self._check_timeout(managed)
+        self._check_beginning(managed)
 
     def _check_wrong_charger(
         self, managed: ManagedCharger, texts: dict[str, str]
@@ -307,6 +316,41 @@ class BusIssues:
                 "ordered": str(ordered),
                 "used": str(used),
             },
+        )
+
+    def _check_beginning(self, managed: ManagedCharger) -> None:
+        """Report a charger that may begin a charge with more than its wiring carries.
+
+        What it begins with is kept while it is not known, as without a connection.
+        """
+        charger = managed.charger
+        begins, limit = charger.begins_with, charger.config.installation_limit
+        if begins is None:
+            return
+        if begins <= limit:
+            self._set(BEGINS_ABOVE_LIMIT, managed.key, present=False)
+            return
+        stored = charger.reading.settings if charger.reading is not None else {}
+        lowered = floor(limit)
+        # Below its minimum it could not charge at all.
+        can_be_lowered = stored.get(Setting.MINIMUM_CURRENT, lowered) <= lowered
+        self._set(
+            BEGINS_ABOVE_LIMIT,
+            managed.key,
+            present=True,
+            placeholders={
+                "charger": self._name(managed),
+                "maximum": f"{begins:g}",
+                "minimum": str(stored.get(Setting.MINIMUM_CURRENT, "-")),
+                "limit": f"{limit:g}",
+                "lowered": str(lowered),
+            },
+            fix={
+                CONF_ENTRY: self._entry.entry_id,
+                CONF_SUBENTRY: managed.subentry_id,
+            }
+            if can_be_lowered
+            else None,
         )
 
     def forget(self, managed: ManagedCharger) -> None:

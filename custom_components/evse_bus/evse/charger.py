@@ -560,17 +560,29 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         raise NotAvailableError(message)
 
     @property
+    def begins_with(self) -> float | None:
+        """Return the current that a car may be offered before its limit is in force, A.
+
+        ``None``: none above its limit, or not known.
+        """
+        return None
+
+    @property
     def settings(self) -> Mapping[Setting, Range]:
         """Return the settings in the charger's own memory, and their ranges."""
         return {}
 
-    async def configure(self, setting: Setting, value: int) -> None:
+    async def configure(
+        self, setting: Setting, value: int, *, only_lower: bool = False
+    ) -> None:
         """Write to the charger's own memory; return when it is read back.
 
-        Such a memory wears out: this is for people, not for automations. Raises
+        Such a memory wears out: this is for people, not for automations.
+        ``only_lower``: a value that is read to be lower stays. Raises
         NotAvailableError where the charger has no such setting, RefusedOrderError
         for a value out of its range, NotConfirmedError, and what `run` raises.
         """
+        del only_lower
         message = f"{self.config.name} has no setting {setting}: {value}"
         raise NotAvailableError(message)
 

@@ -9,6 +9,7 @@ from ..conversation import FollowUp, rest
 from ..errors import GarbledReplyError
 from ..exchange import Turn
 from ..model import Fault, Orders, Range, Setting
+from ..schedule import Kind
 from .config import SmartEvseConfig
 from .dialects import MAPS
 from .reader import SmartEvseReader
@@ -81,5 +82,9 @@ class SmartEvseCharger[C: SmartEvseConfig](SmartEvseReader[C]):
         return ranges
 
     @override
-    async def configure(self, setting: Setting, value: int) -> None:
-        await self.run(setting_conversation(self, setting, value))
+    async def configure(
+        self, setting: Setting, value: int, *, only_lower: bool = False
+    ) -> None:
+        conversation = setting_conversation(self, setting, value, only_lower=only_lower)
+        # As a pause: where the write opens access, closing it does not wait.
+        await self.run(conversation, kind=Kind.PAUSE)

@@ -196,6 +196,14 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
 
     @property
     @override
+    def begins_with(self) -> float | None:
+        if self.configuration is None:
+            return None
+        # Whatever the cable of today: the next one may carry more.
+        return float(self.configuration.settings[Setting.MAXIMUM_CURRENT])
+
+    @property
+    @override
     def settings(self) -> Mapping[Setting, Range]:
         ranges = dict(super().settings)
         if self.configuration is None or not ranges:

@@ -326,8 +326,11 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
 
     # -- Configuration -------------------------------------------------------------
 
-    async def read_configuration(self, turn: Turn) -> None:
-        """Read the settings; a missing or implausible reply changes none of them."""
+    async def read_configuration(self, turn: Turn) -> bool:
+        """Read the settings; return whether they were read.
+
+        A missing or implausible reply changes none of them.
+        """
         dialect = self.known_dialect
         blocks: dict[Block, bytes] = {}
         try:
@@ -339,11 +342,12 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
             # Before they are known the limit is 6 A: then each poll tries again.
             pause = CONFIGURATION_RETRY if self.configuration is not None else 0.0
             self.configuration_due = turn.now + pause
-            return
+            return False
         self.configuration = configuration
         self.configuration_due = turn.now + CONFIGURATION_INTERVAL
         if self.status is not None:
             self.on_status(self.status, turn.now)
+        return True
 
     # -- Access --------------------------------------------------------------------
 

@@ -1,7 +1,7 @@
 """Changing a setting in the EEPROM of a SmartEVSE, once per request of the user.
 
 The write may open access that was off (PROTOCOLS.md, 3): it is closed again in the
-same conversation, before anything else.
+same conversation, before anything else. A car that is plugged in has no time to begin.
 """
 
 from functools import partial
@@ -12,22 +12,27 @@ from ..errors import (
     NotAvailableError,
     NotConfirmedError,
     RefusedOrderError,
+    SupersededError,
 )
 from ..exchange import Turn
 from ..model import Setting
 from .config import SmartEvseConfig
 from .dialects import MAPS
-from .reader import SmartEvseReader
+from .reader import READ_AGAIN, READS, SmartEvseReader
 from .registers import write_setting
 
 
 def setting_conversation(
-    reader: SmartEvseReader[SmartEvseConfig], setting: Setting, value: int
+    reader: SmartEvseReader[SmartEvseConfig],
+    setting: Setting,
+    value: int,
+    *,
+    only_lower: bool = False,
 ) -> Conversation:
     """Return a conversation that changes a setting.
 
-    Raises NotAvailableError where the box has no such setting, RefusedOrderError
-    for a value out of its range.
+    ``only_lower``: one that is read to be lower stays. Raises NotAvailableError where
+    the box has no such setting, RefusedOrderError for a value out of its range.
     """
     span = reader.settings.get(setting)
     if span is None:
@@ -39,24 +44,30 @@ def setting_conversation(
     if not span.minimum <= value <= span.maximum:
         message = f"{setting} is {span.minimum} to {span.maximum}, not {value}"
         raise RefusedOrderError(message)
-    return partial(_set, reader, setting, value)
+    lowest = min(value, 0) if only_lower else value
+    return partial(_set, reader, setting, range(lowest, value + 1))
 
 
 async def _set(
-    reader: SmartEvseReader[SmartEvseConfig], setting: Setting, value: int, turn: Turn
+    reader: SmartEvseReader[SmartEvseConfig],
+    setting: Setting,
+    accepted: range,
+    turn: Turn,
 ) -> None:
+    """Write the highest of the accepted values, unless one of them stands."""
+    value = accepted[-1]
     with reader.conversing():
+        if (quiet := reader.minimum_pause(turn.now)) > 0:
+            await rest(quiet)
         await reader.reach(turn)
         await reader.read_status(turn)
         await rest()
-        await reader.read_configuration(turn)
-        if _is_set(reader, setting, value):
-            # The memory wears out: an equal value is not written.
+        await _check(reader, turn)
+        if _stands(reader, setting, accepted):
+            # The memory wears out: no value is written twice.
             return
         # Kept until access is certain: replies may be lost, or the line.
-        reader.must_close_access |= (
-            reader.status is not None and reader.status.access is False
-        )
+        reader.must_close_access |= not _has_access(reader)
         dialect = reader.known_dialect
         # Once, whatever the reply: the read-back shows whether it took effect.
         await reader.write(
@@ -68,23 +79,56 @@ async def _set(
         if reader.must_close_access:
             await _close_access(reader, turn)
         await _read_back(reader, turn)
-    if not _is_set(reader, setting, value):
-        message = f"{reader.config.name} did not take {setting} = {value}"
+    name = reader.config.name
+    if reader.configuration is None:
+        message = f"{setting} = {value} was sent to {name}, and could not be read back"
+        raise NotConfirmedError(message)
+    if not _stands(reader, setting, accepted):
+        message = f"{name} did not take {setting} = {value}"
         raise NotConfirmedError(message)
 
 
-def _is_set(
-    reader: SmartEvseReader[SmartEvseConfig], setting: Setting, value: int
+async def _check(reader: SmartEvseReader[SmartEvseConfig], turn: Turn) -> None:
+    """Read the settings; raise NotAvailableError where nothing may be written.
+
+    Without them a value that already stands would be written again; without a known
+    access, one that was off could not be put back.
+    """
+    name = reader.config.name
+    if not await reader.read_configuration(turn):
+        message = f"the settings of {name} could not be read: nothing was written"
+        raise NotAvailableError(message, "smartevse_settings_not_read")
+    if reader.status is None or reader.status.access is None:
+        message = f"the access of {name} has no known value: nothing was written"
+        raise NotAvailableError(message, "smartevse_access_not_known")
+
+
+def _has_access(reader: SmartEvseReader[SmartEvseConfig]) -> bool:
+    return reader.status is not None and reader.status.access is True
+
+
+def _stands(
+    reader: SmartEvseReader[SmartEvseConfig], setting: Setting, accepted: range
 ) -> bool:
     configuration = reader.configuration
-    return configuration is not None and configuration.settings.get(setting) == value
+    return configuration is not None and configuration.settings.get(setting) in accepted
 
 
 async def _close_access(reader: SmartEvseReader[SmartEvseConfig], turn: Turn) -> None:
     """Turn access off again where the write has opened it."""
     try:
-        await reader.close_access(turn)
+        if MAPS[reader.known_dialect].balancing.access_is_volatile:
+            # Not read before: a car could begin meanwhile.
+            await reader.set_access(
+                turn, allowed=False, still_wanted=lambda: reader.must_close_access
+            )
+            reader.must_close_access = False
+        else:
+            await reader.close_access(turn)
         await rest()
+    except SupersededError:
+        # The user has allowed it to charge meanwhile.
+        pass
     except EvseError as error:
         message = (
             f"{reader.config.name}: access was off before the setting was written, "
@@ -95,7 +139,9 @@ async def _close_access(reader: SmartEvseReader[SmartEvseConfig], turn: Turn) ->
 
 async def _read_back(reader: SmartEvseReader[SmartEvseConfig], turn: Turn) -> None:
     reader.configuration = None
-    await reader.read_configuration(turn)
-    if reader.configuration is None:
-        # The maximum may have changed: to be read as soon as possible.
-        reader.configuration_due = 0.0
+    for pause in (0.0,) + (READ_AGAIN,) * (READS - 1):
+        await rest(pause)
+        if await reader.read_configuration(turn):
+            return
+    # The maximum may have changed: to be read as soon as possible.
+    reader.configuration_due = 0.0
