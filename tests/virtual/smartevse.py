@@ -1,4 +1,4 @@
-"""A virtual SmartEVSE v2 on the bus: polled, as a slave, or as a master."""
+"""A virtual SmartEVSE on the bus: polled, as a slave or node, or as a master."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 from .device import Device, on_bus_thread
 from .smartevse_controller import SmartEvseController
-from .smartevse_frames import ANSWER_SILENCE, FRAME_GAP, LONGEST
-from .smartevse_registers import DIALECTS, NORMAL
+from .smartevse_frames import ANSWER_SILENCE, FRAME_GAP, WRITE_ONE
+from .smartevse_outlet3 import SmartEvseOutlet3
+from .smartevse_registers import DIALECTS, NORMAL, Dialect
 
 if TYPE_CHECKING:
     import asyncio
@@ -27,12 +28,13 @@ SPREAD = 0.004
 class SmartEvse(Device):
     """A SmartEVSE; `controller` handles its frames, `outlet` has its states.
 
-    - `dialect`: a key of `DIALECTS`; `load_balance`: 0 off, 1 master, else a
-      slave and its unit; `unit`: its address with load balancing off, if not the
+    - `dialect`: a key of `DIALECTS`, or one of your own; `load_balance`: 0 off, 1
+      master, else a slave and its unit; `unit`: its address with load balancing off, if not the
       default of the dialect
     - `config`: "socket" (with a `cable` of 13, 16, 32 or 63 A) or "fixed"
     - `override_works`: False: a 2.17 before the override: refused, no effect
     - `settings`: further stored settings by name, see `smartevse_registers`
+    - `late_answers`: a request while it measures a cable is answered after that
     """
 
     baud: ClassVar[int] = 9600
@@ -41,7 +43,7 @@ class SmartEvse(Device):
 
     def __init__(
         self,
-        dialect: str = "2.17",
+        dialect: str | Dialect = "2.17",
         *,
         load_balance: int = 0,
         car: Car | None = None,
@@ -56,6 +58,7 @@ class SmartEvse(Device):
         settings: dict[str, int] | None = None,
         turn_round: float = 0.01,
         jitter: float = 0.06,
+        late_answers: bool = True,
         name: str = "",
     ) -> None:
         """Make a box that is switched on when the bus starts."""
@@ -68,7 +71,7 @@ class SmartEvse(Device):
             **(settings or {}),
         }
         self.controller = SmartEvseController(
-            DIALECTS[dialect],
+            DIALECTS[dialect] if isinstance(dialect, str) else dialect,
             car,
             cable=cable,
             settings=stored,
@@ -76,6 +79,7 @@ class SmartEvse(Device):
             serial=serial,
             override_works=override_works,
         )
+        self.controller.holds_requests = late_answers
         super().__init__(name or f"smartevse-{self.controller.unit}")
         self.turn_round = turn_round
         self.jitter = jitter
@@ -151,6 +155,12 @@ class SmartEvse(Device):
         return self.controller.eeprom_writes
 
     @property
+    def flash_writes(self) -> int:
+        """Return how often a 3.x has stored its access."""
+        outlet = self.outlet
+        return outlet.flash_writes if isinstance(outlet, SmartEvseOutlet3) else 0
+
+    @property
     def broadcasts(self) -> list[BalanceBroadcast]:
         """Return the charge currents received as a slave."""
         return self.controller.broadcasts
@@ -175,6 +185,7 @@ class SmartEvse(Device):
             "ignored": controller.ignored,
             "writes": len(controller.writes),
             "eeprom_writes": sum(controller.eeprom_writes.values()),
+            "flash_writes": self.flash_writes,
             "broadcasts": len(controller.broadcasts),
             "state": self.state,
             "error": self.error,
@@ -193,7 +204,7 @@ class SmartEvse(Device):
 
     @on_bus_thread
     def power_cycle(self) -> None:
-        """Lose power for a moment: access is open again, the override is gone."""
+        """Lose power for a moment: what is volatile is gone, the override too."""
         self.controller.power_cycle()
 
     @on_bus_thread
@@ -225,7 +236,9 @@ class SmartEvse(Device):
             data = sending.pop(0)
             # Real boxes do not run in step, as our ticks do, and do not detect the same
             # silence at the same moment.
-            wait = bus.rng.random() * self.jitter if data[0] == self.unit else 0.0
+            # A late answer has waited long enough.
+            asks = data[0] == self.unit and data[1] == WRITE_ONE
+            wait = bus.rng.random() * self.jitter if asks else 0.0
             silence = ANSWER_SILENCE + EPSILON + bus.rng.random() * SPREAD
             self.unasked += 1
             self.send(data, wait, silence)
@@ -257,7 +270,8 @@ class SmartEvse(Device):
             self._take_frame()
 
     def _take_frame(self) -> None:
-        data, self._received = bytes(self._received[: LONGEST + 1]), bytearray()
+        longest = self.controller.dialect.longest
+        data, self._received = bytes(self._received[: longest + 1]), bytearray()
         ended = self._received_until
         answer = self.controller.receive(data, self.now())
         self._speak()

@@ -17,7 +17,7 @@ from .smartevse_frames import (
     write_frame,
     write_several_frame,
 )
-from .smartevse_registers import DIALECTS
+from .smartevse_registers import DIALECTS, Dialect
 
 if TYPE_CHECKING:
     from .car import Car
@@ -32,7 +32,7 @@ class SmartEvseAlone:
 
     def __init__(
         self,
-        dialect: str = "2.17",
+        dialect: str | Dialect = "2.17",
         car: Car | None = None,
         *,
         cable: int = 16,
@@ -44,7 +44,7 @@ class SmartEvseAlone:
     ) -> None:
         """Switch it on."""
         self.box = SmartEvseController(
-            DIALECTS[dialect],
+            DIALECTS[dialect] if isinstance(dialect, str) else dialect,
             car,
             cable=cable,
             unit=unit,
@@ -109,7 +109,10 @@ class SmartEvseAlone:
         if answer == good:
             return "ok"
         for code in range(1, 5):
-            if answer == exception_frame(unit, function, code):
+            if answer in (
+                exception_frame(unit, function, code),
+                exception_frame(unit, function | 0x80, code),
+            ):
                 return f"refused {code}"
         return answer.hex()
 

@@ -24,8 +24,10 @@ from .smartevse_frames import (
     write_several_frame,
 )
 from .smartevse_history import BalanceBroadcast, Handshake, RegisterWrite
-from .smartevse_outlet import COMM_TIMEOUT, SmartEvseOutlet
-from .smartevse_registers import MASTER, NO_CURRENT, NORMAL, Setting
+from .smartevse_nodes import Nodes
+from .smartevse_outlet import SmartEvseOutlet
+from .smartevse_outlet3 import EV_TIMEOUT, SmartEvseOutlet3
+from .smartevse_registers import MASTER, NO_CURRENT, NORMAL, SOLAR, Setting
 from .smartevse_states import pwm_of
 
 if TYPE_CHECKING:
@@ -38,6 +40,8 @@ ACKNOWLEDGEMENTS = range(0x81, 0x85)
 REQUESTS = range(0x01, 0x05)
 KELVIN = 273
 VOLATILE_MODE_2_17 = 0xA8
+# The read of a meter: register and number; each type of meter has its own.
+METER_READ = (0, 4)
 
 
 class SmartEvseController:
@@ -47,6 +51,9 @@ class SmartEvseController:
     `factory_new`: it stored its settings when it was switched on, and reports them as
     changed until a power cycle (2.30 and HEAD, `reads`).
     `receive` takes one frame; after `step`, `sending` has the frames to send.
+    `holds_requests`: a request while it measures a cable is answered after that;
+    `answers_as_before`: with the state before it (`node_power_cycle` at 4 s, unit 2;
+    `node_with_master` at 132.57 s has the one after it).
     """
 
     def __init__(
@@ -63,7 +70,8 @@ class SmartEvseController:
     ) -> None:
         """Make a controller that was just switched on."""
         self.dialect = dialect
-        self.outlet = SmartEvseOutlet(dialect, car, cable=cable, settings=settings)
+        outlet = SmartEvseOutlet3 if dialect.version3 else SmartEvseOutlet
+        self.outlet = outlet(dialect, car, cable=cable, settings=settings)
         self.unit_when_disabled = dialect.unit_when_disabled if unit is None else unit
         self.serial = serial
         self.override_works = override_works
@@ -77,9 +85,14 @@ class SmartEvseController:
         self.answers: list[Handshake] = []
         self.slave_requests: list[tuple[int, Handshake]] = []
         self.config_changed = int(factory_new)
+        self.nodes = Nodes(dialect, self.outlet)
+        self.holds_requests = False
+        self.answers_as_before = False
         self.dropped = 0
         self.ignored = 0
         self._last_request: tuple[int, int] | None = None
+        self._held: Packet | None = None
+        self._held_answer: bytes | None = None
 
     @property
     def unit(self) -> int:
@@ -92,6 +105,7 @@ class SmartEvseController:
         self.sending.clear()
         self.config_changed = 0
         self._last_request = None
+        self._held = self._held_answer = None
 
     def step(self, now: float) -> None:
         """Advance to `now`; the frames to send are then in `sending`."""
@@ -99,14 +113,13 @@ class SmartEvseController:
         out = self.outlet
         cycles = out.cycles
         out.step(now)
+        if not out.measuring_cable:
+            self._answer_held()
         for register, value in out.asked:
             self.requests_sent.append(Handshake(now, register, value))
             self._say_request(write_frame(self.unit, register, value))
         out.asked.clear()
-        for unit in out.polls_due:
-            register, count = self.dialect.polled or (0, 0)
-            self._say_request(read_frame(unit, register, count))
-        out.polls_due.clear()
+        self._poll()
         error_register = self.dialect.register_of("error")
         for bits in out.error_broadcasts:
             register = error_register if self.dialect.status_writable else 2
@@ -115,17 +128,45 @@ class SmartEvseController:
         if out.load_balance == MASTER and out.cycles != cycles:
             self._broadcast()
 
+    def _poll(self) -> None:
+        """Ask meters and nodes, and reply to what those ask for."""
+        out = self.outlet
+        if isinstance(out, SmartEvseOutlet3):
+            for address in out.meters_due:
+                self._say_request(read_frame(address, *METER_READ))
+            out.meters_due.clear()
+        for unit in out.polls_due:
+            register, count = self.dialect.polled or (0, 0)
+            self._say_request(read_frame(unit, register, count))
+        out.polls_due.clear()
+        if out.round_begins:
+            out.plan_polls(self.nodes.due(), self.now)
+        if out.write_due:
+            write = (
+                self.nodes.next_write(self.now) if out.load_balance == MASTER else None
+            )
+            if write is not None:
+                self._write_to_node(*write)
+            out.write_sent(self.now, written=write is not None)
+
     def _broadcast(self) -> None:
         """As a master: broadcast the charge currents."""
         sharing = self.outlet.sharing
         sharing.currents[0] = self.outlet.current
+        if self.dialect.measures:
+            self.nodes.measure(self.now)
         self._say_request(
             write_several_frame(
                 self.dialect.broadcast_unit,
                 self.dialect.balance_register,
                 *sharing.currents,
+                *[0] * self.dialect.mains_words,
             )
         )
+
+    def _write_to_node(self, unit: int, state: int, error: int) -> None:
+        register = self.dialect.register_of("state")
+        self._say_request(write_several_frame(unit, register, state, error))
 
     def _say_request(self, data: bytes) -> None:
         self._last_request = (data[0], data[1])
@@ -134,24 +175,49 @@ class SmartEvseController:
     # Frames
 
     def receive(self, data: bytes, now: float) -> bytes | None:
-        """Take a frame that silence has ended; return the reply, if any."""
+        """Take a frame that silence has ended; return the reply, if any.
+
+        A late one is in `sending` later.
+        """
         self.step(now)
-        packet = decode(data, self.dialect.functions)
+        packet = decode(data, self.dialect.functions, self.dialect.longest)
         if packet is None or not self._is_request(packet):
             return None
         if self.outlet.load_balance <= MASTER and self.dialect.external_master:
             self.outlet.external_master = 4
+        if self.holds_requests and self.outlet.measuring_cable:
+            self._hold(packet)
+            return None
         answer = self._execute(packet)
         if answer is None:
             self.ignored += 1
         return answer
 
+    def _hold(self, packet: Packet) -> None:
+        """Keep a request while it measures a cable, and does nothing else."""
+        if self.answers_as_before:
+            self._held_answer = self._execute(packet)
+        else:
+            self._held = packet
+
+    def _answer_held(self) -> None:
+        answer, self._held_answer = self._held_answer, None
+        packet, self._held = self._held, None
+        if packet is not None:
+            answer = self._execute(packet)
+        if answer is not None:
+            self.sending.append(answer)
+
     def _is_request(self, packet: Packet) -> bool:
         """Return whether it is a request; a reply matches the last request on the bus."""
         if packet.kind == "answer":
+            self._take_reply(packet)
             self._last_request = None
             return False
         this = (packet.unit, packet.function)
+        if self.dialect.version3:
+            # A node looks at the address alone; a master or a disabled one never answers.
+            return self.outlet.slave
         broadcast = packet.unit == self.dialect.broadcast_unit
         counts = not broadcast or not self.dialect.status_writable
         if packet.kind == "either" and this == self._last_request and counts:
@@ -163,6 +229,17 @@ class SmartEvseController:
             return True
         self._last_request = this
         return True
+
+    def _take_reply(self, packet: Packet) -> None:
+        """Take the reply to a poll of a node, or that of the EV meter."""
+        out = self.outlet
+        polled = self._last_request == (packet.unit, packet.function)
+        if out.load_balance == MASTER and polled and packet.values:
+            self.nodes.replied(packet.unit, packet.values, self.now)
+        if not isinstance(out, SmartEvseOutlet3) or not packet.values:
+            return
+        if packet.unit == out.settings["ev_address"]:
+            out.ev_timeout = EV_TIMEOUT
 
     def _execute(self, packet: Packet) -> bytes | None:
         if self._acknowledge(packet):
@@ -190,9 +267,13 @@ class SmartEvseController:
             return None
         items = self.dialect.find(packet.register, packet.count)
         if items is None:
-            return exception_frame(packet.unit, packet.function, ILLEGAL_ADDRESS)
+            return self._refusal(packet, ILLEGAL_ADDRESS)
         values = [self.value_of(item) & 0xFFFF for item in items]
         return values_frame(packet.unit, packet.function, values)
+
+    def _refusal(self, packet: Packet, code: int) -> bytes:
+        standard = 0x80 if self.dialect.version3 else 0
+        return exception_frame(packet.unit, packet.function | standard, code)
 
     def value_of(self, item: str | Setting) -> int:
         """Return the value of a register."""
@@ -202,6 +283,10 @@ class SmartEvseController:
         maximum = out.cable_measured
         if not self.dialect.reports_cable:
             maximum = min(out.settings["max_current"], maximum)
+        kelvin, access = KELVIN, int(out.access)
+        if isinstance(out, SmartEvseOutlet3):
+            kelvin = 0 if out.version.celsius else KELVIN
+            access = out.access_word
         values = {
             "state": self.dialect.states[out.state],
             "error": out.error,
@@ -209,12 +294,12 @@ class SmartEvseController:
             "maximum": maximum,
             "minimum": out.settings["min_current"],
             "current": out.current,
-            "access": int(out.access),
+            "access": access,
             "mode_now": out.settings["mode"],
             "solar_timer": out.solar_timer,
             "config_changed": self.config_changed,
             "phases": out.phases,
-            "temperature": out.temperature_measured + KELVIN,
+            "temperature": out.temperature_measured + kelvin,
             "serial": self.serial,
             "ev_meter_now": out.settings.get("ev_meter", 0),
             "ev_address_now": out.settings.get("ev_address", 0),
@@ -234,9 +319,9 @@ class SmartEvseController:
             return None
         unit, function = packet.unit, packet.function
         if items is None:
-            return exception_frame(unit, function, ILLEGAL_ADDRESS)
+            return self._refusal(packet, ILLEGAL_ADDRESS)
         if not taken:
-            return exception_frame(unit, function, ILLEGAL_VALUE)
+            return self._refusal(packet, ILLEGAL_VALUE)
         if function == WRITE_ONE:
             return write_frame(unit, packet.register, packet.values[0])
         return frame(unit, function, words(packet.register, taken))
@@ -283,6 +368,8 @@ class SmartEvseController:
             taken = self.dialect.status_writable
             if self.override_works:
                 out.override = value
+        elif isinstance(out, SmartEvseOutlet3) and item in ("access", "mode_now"):
+            taken = self._set_3(out, item, value)
         elif item == "access":
             taken = value in (0, 1) or self.dialect.status_writable
             if value in (0, 1) and not self.ignore_access:
@@ -292,6 +379,16 @@ class SmartEvseController:
         else:
             taken = self.dialect.status_writable and self._set_status(item, value)
         return taken
+
+    def _set_3(self, out: SmartEvseOutlet3, item: str, value: int) -> bool:
+        """Set access or mode of a 3.x, which answers any value."""
+        highest = out.version.highest_access
+        if item == "mode_now":
+            if value <= SOLAR:
+                out.set_mode(value)
+        elif highest is None or value <= highest:
+            out.set_access(value)
+        return True
 
     def _set_mode(self, value: int) -> bool:
         """Set the mode without storing it."""
@@ -308,6 +405,8 @@ class SmartEvseController:
     def _set_status(self, item: str, value: int) -> bool:
         """Set a register that only the master of a later dialect writes."""
         out = self.outlet
+        if item == "state" and self.dialect.version3 and value == self.value_of(item):
+            return True
         if item == "state":
             names = {code: name for name, code in self.dialect.states.items()}
             state = names.get(value, "A")
@@ -319,8 +418,8 @@ class SmartEvseController:
             out.solar_timer = value
         elif item == "config_changed":
             self.config_changed = value
-        elif item == "phases" and value <= 3 and self.dialect.gentle:
-            # 2.30 refuses it (`normal`).
+        elif item == "phases" and value <= 3 and self.dialect.measures:
+            # Only HEAD takes it (2.30: `normal`; 3.x as read).
             out.phases = value
         else:
             return False
@@ -340,7 +439,7 @@ class SmartEvseController:
             return True
         self.broadcasts.append(BalanceBroadcast(self.now, packet.values))
         out.current = packet.values[index]
-        out.comm_timeout = COMM_TIMEOUT
+        out.comm_timeout = out.comm_time
         if self.dialect.status_writable and not out.current and out.state == "C":
             out.go("C1" if self.dialect.gentle else "A")
         elif out.state in ("B", "C"):

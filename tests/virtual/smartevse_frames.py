@@ -70,7 +70,7 @@ def values_frame(unit: int, function: int, values: list[int]) -> bytes:
 
 
 def exception_frame(unit: int, function: int, code: int) -> bytes:
-    """Return a refusal as these boxes send it: without the 0x80 in the function."""
+    """Return a refusal; the boxes of v2 send it without the 0x80 in the function."""
     return frame(unit, function, bytes((code,)))
 
 
@@ -78,7 +78,8 @@ def exception_frame(unit: int, function: int, code: int) -> bytes:
 class Packet:
     """A frame with a good checksum, as a box decodes it.
 
-    `values`: the words of a write. The register of a reply is not known.
+    `values`: the words of a write, or of the reply to a read, whose register is not
+    known.
     """
 
     unit: int
@@ -89,9 +90,11 @@ class Packet:
     values: tuple[int, ...] = ()
 
 
-def decode(data: bytes, functions: tuple[int, ...]) -> Packet | None:
+def decode(
+    data: bytes, functions: tuple[int, ...], longest: int = LONGEST
+) -> Packet | None:
     """Return a frame as a box decodes it, or None if the box ignores it."""
-    if not SHORTEST <= len(data) <= LONGEST or crc16(data[:-2]) != data[-2:]:
+    if not SHORTEST <= len(data) <= longest or crc16(data[:-2]) != data[-2:]:
         return None
     unit, function = data[0], data[1]
     if function not in functions:
@@ -110,7 +113,7 @@ def decode(data: bytes, functions: tuple[int, ...]) -> Packet | None:
 def _decode_long(unit: int, function: int, data: bytes) -> Packet | None:
     """Return a reply to a read, or a request to write several."""
     if function in READS and data[2] == len(data) - 5:
-        return Packet(unit, function, "answer")
+        return Packet(unit, function, "answer", values=_split(data[3:-2]))
     if function == WRITE_SEVERAL and data[6] == len(data) - 9:
         register = int.from_bytes(data[2:4], "big")
         count = int.from_bytes(data[4:6], "big")

@@ -29,10 +29,12 @@ POLL_SPACING, POLL_TO_BROADCAST = 0.109, 0.129
 class SmartEvseOutlet(SmartEvseStates):
     """One outlet with a clock: `step` brings it up to a time.
 
-    `second`: the duration of its second, s.
+    `second`: the duration of its second, s; `comm_time`: its count of seconds without
+    a broadcast.
     """
 
     second = SECOND
+    comm_time = COMM_TIMEOUT
 
     # Time
 
@@ -59,11 +61,14 @@ class SmartEvseOutlet(SmartEvseStates):
             self.polls_due.append(self._polls.pop(0)[1])
         if self._cycle_at is not None and now >= self._cycle_at:
             self._cycle_at = None
-            self.calculate()
+            if self._polls_nodes:
+                self.write_due = True
+            else:
+                self.calculate()
         if self._second_at is not None and now >= self._second_at:
             self._second_at += self.second
             self._every_second(now)
-        if self.error & NO_COMM and self.comm_timeout == COMM_TIMEOUT:
+        if self.error & NO_COMM and self.comm_timeout == self.comm_time:
             self.error &= ~NO_COMM
         if self.slave and self.charge_delay == 0 and not self.dialect.gentle:
             self.error &= ~(LESS_6A | NO_SUN)
@@ -80,11 +85,7 @@ class SmartEvseOutlet(SmartEvseStates):
                 self.go("B")
                 self._activation = NEVER
         if self.state == "C1":
-            if self._c1_timer:
-                self._c1_timer -= 1
-            else:
-                self.go("B1")
-                self.charge_delay = STOP_DELAY
+            self._wait_for_the_car()
         if self.solar_timer:
             self.solar_timer -= 1
             if not self.solar_timer:
@@ -96,6 +97,15 @@ class SmartEvseOutlet(SmartEvseStates):
         if self.external_master:
             self.external_master -= 1
         self._run_cycle(now)
+
+    def _wait_for_the_car(self) -> None:
+        """Open the contactor under a car that does not end its request in C1."""
+        if self._c1_timer:
+            self._c1_timer -= 1
+            return
+        self.go("B1")
+        if not self.dialect.version3:
+            self.charge_delay = STOP_DELAY
 
     def _check_errors(self) -> None:
         if self.temperature < COOL_AGAIN:
@@ -132,12 +142,31 @@ class SmartEvseOutlet(SmartEvseStates):
         self._cycle = 1
         if self.settings["mode"] != NORMAL and not self.meter_works:
             return
-        self.comm_timeout = COMM_TIMEOUT
+        self.comm_timeout = self.comm_time
         self._cycle_at = now + (POLLING if self.dialect.status_writable else 0.0)
-        if self.load_balance == MASTER and self.dialect.polled:
-            nodes = range(MASTER + 1, self.dialect.units + 1)
-            self._polls = [(now + POLL_SPACING * n, u) for n, u in enumerate(nodes)]
-            self._cycle_at = self._polls[-1][0] + POLL_TO_BROADCAST
+        if self._polls_nodes:
+            self.round_begins = True
+            self._cycle_at = None
+
+    @property
+    def _polls_nodes(self) -> bool:
+        """Return whether it is the master of a later dialect."""
+        return self.load_balance == MASTER and self.dialect.polled is not None
+
+    def plan_polls(self, nodes: list[int], now: float) -> None:
+        """As a master: poll these nodes, one after the other."""
+        self.round_begins = False
+        self._polls = [(now + POLL_SPACING * n, u) for n, u in enumerate(nodes)]
+        last = self._polls[-1][0] if self._polls else now
+        self._cycle_at = last + POLL_TO_BROADCAST
+
+    def write_sent(self, now: float, *, written: bool) -> None:
+        """As a master: one write more, or none is left before the broadcast."""
+        self.write_due = False
+        if written:
+            self._cycle_at = now + POLL_TO_BROADCAST
+        else:
+            self.calculate()
 
     def calculate(self) -> None:
         """Set current and PWM: its own cycle."""

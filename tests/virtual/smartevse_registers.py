@@ -1,15 +1,22 @@
-"""The registers of the SmartEVSE v2 dialects, as tables.
+"""The registers of the SmartEVSE dialects, as tables.
 
 The C and E tables of the manual do not match the recorded firmware; the order here is
-that of the recording.
+that of the recording. 3.x was read in its sources (main.h, main.cpp, modbus.cpp), not
+recorded; the sources are four lines of versions.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from .smartevse_frames import READ_HOLDING, READ_INPUT, WRITE_ONE, WRITE_SEVERAL
+from .smartevse_frames import (
+    LONGEST,
+    READ_HOLDING,
+    READ_INPUT,
+    WRITE_ONE,
+    WRITE_SEVERAL,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -47,6 +54,33 @@ class Block:
 
 
 @dataclass(frozen=True, slots=True)
+class Version3:
+    """The habits of one line of 3.x versions, as a node.
+
+    `access_stored`: access is in the flash memory, written at each change;
+    `highest_access`: values above it are answered and ignored (None: unchecked);
+    `celsius`: else the temperature is in K; `no_comm`: the count of seconds without a
+    broadcast, which is checked before it is decremented; `no_comm_in_normal`: also in
+    mode normal. What the sources do not settle for each line: `mode_opens_access` (a
+    changed mode word), `mode_stored`, `settings_open_access`, `pilot_cut` (seconds that
+    B1 cuts the pilot if access is on), `modem` (seconds in each of the states 11, 12
+    and 13 of a new car before it asks; 0: none. The newest source has them for boxes
+    without a master only).
+    """
+
+    access_stored: bool = True
+    highest_access: int | None = None
+    celsius: bool = True
+    no_comm: int = 11
+    no_comm_in_normal: bool = True
+    mode_opens_access: bool = True
+    mode_stored: bool = True
+    settings_open_access: bool = False
+    pilot_cut: int = 5
+    modem: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class Dialect:
     """The frames and registers of one firmware.
 
@@ -55,7 +89,10 @@ class Dialect:
     another master stop its own cycle; `reports_cable`: its maximum is that of the cable
     alone (traces, `normal`); `measures`: it searches for the smallest current of each car first, and
     ignores the override meanwhile (trace of HEAD, `first_minutes`); `balance_register`: for the charge currents that
-    a master broadcasts; `polled`: the registers that it reads at its nodes; `silent`: write-only registers without a reply.
+    a master broadcasts; `polled`: the registers that it reads at its nodes; `silent`: write-only registers without a reply;
+    `version3`: 3.x, which differs in much more; `mains_words`: currents of the mains
+    that the broadcast of a master has behind those of the nodes; `longest`: frame that
+    it receives, in bytes.
     """
 
     name: str
@@ -73,6 +110,9 @@ class Dialect:
     reports_cable: bool = False
     measures: bool = False
     polled: tuple[int, int] | None = None
+    version3: Version3 | None = None
+    mains_words: int = 0
+    longest: int = LONGEST
 
     def find(self, register: int, count: int) -> tuple[str | Setting, ...] | None:
         """Return the items of these registers, or None for an unmapped one."""
@@ -377,4 +417,79 @@ HEAD = Dialect(
     measures=True,
 )
 
-DIALECTS = {dialect.name: dialect for dialect in (V2_17, V2_20, V2_30, HEAD)}
+
+# -- 3.x ---------------------------------------------------------------------------
+
+# States 11 to 14: a modem (ISO 15118) requests, waits, is done, was denied.
+_MODEM_STATES = ("M1", "M2", "M3", "M4")
+_SWITCH_3 = Setting("switch", 0, 7)
+# What the words from 0x020A on mean differs between the lines; never used here.
+_REST_3 = tuple(Setting(f"rest_{number:02}", 0, 0xFFFF) for number in range(16))
+
+
+def _system_3(words: int) -> Block:
+    """Return the block 0x0200 of 22 or 26 words."""
+    block = (
+        MODE,
+        Setting("circuit", 10, 160, 16),
+        GRID,
+        Setting("sensorbox_wifi", 0, 2),
+        Setting("mains", 10, 200, 25),
+        Setting("start_current", 0, 48, 4),
+        STOP_TIME,
+        Setting("import_current", 0, 48, 0),
+        Setting("mains_meter", 0, 0xFF, 0),
+        Setting("mains_address", 10, 247, 10),
+        *_REST_3,
+    )
+    return Block(0x0200, block[:words])
+
+
+def _dialect_3(
+    name: str, version3: Version3, *, system: int, broadcast: int
+) -> Dialect:
+    """Return a line of 3.x; `system`: words of 0x0200; `broadcast`: of its master's."""
+    box = tuple(_SWITCH_3 if one is SWITCH else one for one in _BOX_LATER.items)
+    return Dialect(
+        name=name,
+        functions=(READ_HOLDING, READ_INPUT, WRITE_ONE, WRITE_SEVERAL),
+        unit_when_disabled=1,
+        broadcast_unit=9,
+        balance_register=0x20,
+        units=8,
+        states={n: index for index, n in enumerate((*_LATER_STATES, *_MODEM_STATES))},
+        blocks=(_STATUS_LATER, Block(0x0100, box), _system_3(system)),
+        silent=frozenset(),
+        gentle=True,
+        polled=(0x0000, 8),
+        version3=version3,
+        mains_words=broadcast - 8,
+        longest=256,
+    )
+
+
+_FIRST_3 = Version3(
+    access_stored=False, highest_access=1, celsius=False, no_comm=10, mode_stored=False
+)
+# The first 3.x; the line of Serkri; 3.5 and 3.6, of which only the time-out was read
+# (access and maximum could be as before or after); 3.8; the one of 2026.
+V3_00 = replace(
+    _dialect_3("3.00", _FIRST_3, system=26, broadcast=8), reports_cable=True
+)
+V3_SERKRI = replace(
+    _dialect_3(
+        "3-serkri",
+        replace(_FIRST_3, celsius=True, no_comm_in_normal=False),
+        system=26,
+        broadcast=8,
+    ),
+    reports_cable=True,
+)
+V3_6 = _dialect_3(
+    "3.6", Version3(no_comm=10, no_comm_in_normal=False), system=26, broadcast=11
+)
+V3_8 = _dialect_3("3.8", Version3(), system=26, broadcast=11)
+V3 = _dialect_3("3", Version3(), system=22, broadcast=11)
+LINES_3 = (V3_00, V3_SERKRI, V3_6, V3_8, V3)
+
+DIALECTS = {dialect.name: dialect for dialect in (V2_17, V2_20, V2_30, HEAD, *LINES_3)}

@@ -51,6 +51,8 @@ def pwm_of(tenths: int) -> float:
 class SmartEvseStates:
     """One outlet without a clock of its own; plain attributes may be set at any time.
 
+    `request_lasts`: time that a car must request power before the box follows, s.
+
     - `settings`: the stored settings by name; `override` and `current` in 0.1 A
     - `access`, `error` (bits), `state`, `contactor` (closed or not)
     - `pilot_current`: the current that the pilot signals, A; 0 = no PWM
@@ -58,6 +60,8 @@ class SmartEvseStates:
     - `temperature` in degrees; `meter_works`, `meter_leaves` (A) of its mains meter,
       which it has in the modes smart and solar
     """
+
+    request_lasts = DEBOUNCE
 
     def __init__(
         self,
@@ -90,6 +94,8 @@ class SmartEvseStates:
         self.error_broadcasts: list[int] = []
         # As a master of a later dialect: nodes to poll now.
         self.polls_due: list[int] = []
+        # As one: a round begins; it may write to a node before the broadcast.
+        self.round_begins = self.write_due = False
         self.cycles = 0
         self._now: float | None = None
         self.power_up()
@@ -303,7 +309,9 @@ class SmartEvseStates:
                 self._leave(now)
         elif pilot == CHARGING:
             ready = not self.error and not self.charge_delay and self.state == "B"
-            if self._lasts("C", now, DEBOUNCE) and ready:
+            if self.dialect.version3:
+                ready = ready and self.access
+            if self._lasts("C", now, self.request_lasts) and ready:
                 if self.slave:
                     self._ask("G", now)
                 elif self._enough():
