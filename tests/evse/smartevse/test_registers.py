@@ -38,7 +38,6 @@ from custom_components.evse_bus.evse.smartevse.dialects import (
     Status,
 )
 from custom_components.evse_bus.evse.smartevse.probing import find_dialect
-from custom_components.evse_bus.evse.smartevse.readings import charger_reading
 from custom_components.evse_bus.evse.smartevse.registers import (
     MalformedRefusalError,
     decode_configuration,
@@ -413,16 +412,6 @@ def test_later_states() -> None:
 def test_an_impossible_temperature_is_none() -> None:
     assert decode_status(HEAD, later(kelvin=0)).temperature is None
     assert decode_status(HEAD, later(serial=0)).serial is None
-
-
-def test_273_k_after_power_up_is_no_temperature() -> None:
-    """As recorded (`power_cycle`); later it is 0 degrees Celsius."""
-    after = words(0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 273, 0)
-    for status, shown in ((after, None), (later(kelvin=273), 0.0)):
-        reading = charger_reading(
-            V2_30, decode_status(V2_30, status), None, plug_known=True
-        )
-        assert reading.temperature == shown
 
 
 def test_a_current_out_of_range_is_6_a() -> None:

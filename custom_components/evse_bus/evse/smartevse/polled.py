@@ -241,9 +241,7 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
 
     @override
     def on_status(self, status: Status, now: float) -> None:
-        before = self.status
-        if before is not None and before.maximum and status.maximum is None:
-            # Only a restart forgets the cable.
+        if self.has_restarted(status):
             self._written = None
         super().on_status(status, now)
         charging = status.raw_state in CHARGING

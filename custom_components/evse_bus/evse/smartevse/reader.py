@@ -6,6 +6,7 @@ exchange at most, so that the broadcast of a master waits for one only. PROTOCOL
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from math import inf
 from typing import ClassVar, Final, override
 
@@ -78,6 +79,8 @@ HIDDEN_BY_ERROR: Final = 65.0
 before it resumes."""
 HIDDEN_BY_START: Final = 10.0
 """After its power-up and after NO_COMM likewise, s; 7 s were recorded."""
+COLD: Final = 5
+"""From at most so many degrees Celsius, above or below 0, a reading of 0 is believed."""
 
 
 class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
@@ -99,6 +102,8 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
         """Pending cleanup: writing a setting may have opened access that was off."""
         self._serial: str | None = None
         self._plug_hidden_until = 0.0
+        self._temperature: int | None = None
+        """The last temperature that it has measured, degrees Celsius."""
         self._implausible_replies = 0
         self._unanswered_probes = 0
 
@@ -148,12 +153,15 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
         self.configuration = None
         self.configuration_due = 0.0
         self._plug_hidden_until = 0.0
+        self._temperature = None
 
     @override
     def on_missed(self, now: float, why: str) -> None:
         super().on_missed(now, why)
         # The next reply may be another box's: read it before anything is written.
         self.status = None
+        # Or it was switched off and on again.
+        self._temperature = None
 
     # -- Identity ------------------------------------------------------------------
 
@@ -288,6 +296,7 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
         """Accept a status, and make a reading of it."""
         dialect = self.known_dialect
         self._hide_plug(dialect, status, now)
+        status = self._with_measured_temperature(status)
         self.status = status
         reading = charger_reading(
             dialect,
@@ -305,6 +314,23 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
             patience=FOLLOW_TIME if status.raw_state in CHARGING else None,
         )
 
+    def _with_measured_temperature(self, status: Status) -> Status:
+        """Return a status without the 0 degrees that a box reports after power-up.
+
+        They are believed from one that was about as cold before.
+        """
+        before = None if self.has_restarted(status) else self._temperature
+        if status.temperature == 0 and (before is None or abs(before) > COLD):
+            status = replace(status, temperature=None)
+        self._temperature = status.temperature
+        return status
+
+    def has_restarted(self, status: Status) -> bool:
+        """Return whether a new status shows that the box was switched off and on."""
+        before = self.status
+        # Only a restart forgets the cable.
+        return before is not None and bool(before.maximum) and status.maximum is None
+
     def _hide_plug(self, dialect: Dialect, status: Status, now: float) -> None:
         """Take note of how long ``A`` does not mean that there is no car."""
         before = self.status
@@ -315,9 +341,7 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
         elif status.raw_state != UNPLUGGED:
             self._plug_hidden_until = 0.0
         elif (
-            before is None
-            or before.raw_state in WAITING
-            or (before.maximum is not None and status.maximum is None)
+            before is None or before.raw_state in WAITING or self.has_restarted(status)
         ):
             # Perhaps it was just switched on, or cleared NO_COMM: it knows of no cable,
             # or was out of sight. Or its master was late, and it asks again.

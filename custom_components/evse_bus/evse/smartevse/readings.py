@@ -97,7 +97,7 @@ def charger_reading(
             (float(one) for one in maxima if one is not None), default=None
         ),
         mode=status.mode,
-        temperature=_temperature(status),
+        temperature=None if status.temperature is None else float(status.temperature),
         settings=settings,
         faults=faults_of(dialect, status),
         fault_codes=(f"0x{status.error:02X}",) if status.error else (),
@@ -110,10 +110,3 @@ def charger_reading(
             "cable_current": status.maximum,
         },
     )
-
-
-def _temperature(status: Status) -> float | None:
-    # Until its first measurement a box that was just switched on reports 273 K.
-    if status.temperature is None or (not status.temperature and not status.maximum):
-        return None
-    return float(status.temperature)
