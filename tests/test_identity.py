@@ -534,6 +534,32 @@ async def test_a_box_that_turns_out_to_be_set_up_elsewhere_is_taken_off(
                 await hass.config_entries.async_unload(entry.entry_id)
 
 
+async def test_a_box_that_was_not_accepted_does_not_become_the_expected_one(
+    hass: HomeAssistant,
+) -> None:
+    """Its cable is put right, and its older subentry is removed later."""
+    one, two, right = AblBox(1), AblBox(1), AblBox(1, serial="2W22xy00000009")
+    with VirtualBus.in_loop(one) as old_bus, VirtualBus.in_loop(two) as new_bus:
+        known = twin("Old", "01A", serial=one.serial)
+        old = await setup_bus(hass, "abl", old_bus.url, known, entry_id="old")
+        new = await setup_bus(
+            hass, "abl", new_bus.url, twin("New", "01B"), entry_id="new"
+        )
+        await wait_until(hass, lambda: issues(hass) == {"set_up_twice_01B"})
+        await wait_until(hass, lambda: not new.runtime_data.chargers)
+        assert new.subentries["01B"].data["serial"] is None
+        new_bus.remove(two)
+        new_bus.add(right)
+        hass.config_entries.async_remove_subentry(old, "01A")
+        await wait_until(hass, lambda: "01B" in new.runtime_data.chargers)
+        await get_entity(hass, "sensor", new, "1_status")
+        assert new.subentries["01B"].data["serial"] == right.serial
+        assert "refused" not in new.subentries["01B"].data
+        assert not issues(hass)
+        for entry in (old, new):
+            await hass.config_entries.async_unload(entry.entry_id)
+
+
 @pytest.mark.usefixtures("socket_enabled")
 @pytest.mark.parametrize("older", ["line", "network"])
 async def test_an_ews_box_on_a_line_and_on_the_network_has_one_master(

@@ -19,7 +19,6 @@ from .const import (
     CONF_PORTS,
     CONF_PROTOCOL,
     CONF_REPLY_TIMEOUT,
-    CONF_SERIAL,
     CONF_STOP_BITS,
     CONF_SUPPLY_LIMIT,
     CONF_SUPPLY_MINIMUM,
@@ -41,7 +40,6 @@ if TYPE_CHECKING:
     from .evse.protocol import Protocol
 
 _OPTIONAL_FIELDS: Final[Mapping[str, Callable[[Any], object]]] = {
-    CONF_SERIAL: str,
     CONF_VOLTAGE: float,
     CONF_POLL_INTERVAL: float,
     CONF_ORDER_LIFETIME: lambda minutes: float(minutes) * 60,
@@ -102,6 +100,7 @@ def charger_configs(
     conversions = dict(_OPTIONAL_FIELDS) | {
         option.name: option.load for option in protocol.options
     }
+    conversions |= {name: fact.load for name, fact in protocol.config.facts.items()}
     optional: dict[str, Any] = {
         key: convert(stored[key])
         for key, convert in conversions.items()
@@ -158,10 +157,12 @@ def changes_in_place(old: ChargerConfig, new: ChargerConfig) -> bool:
     """Return whether a running charger can take a new configuration.
 
     It cannot if a field has changed that is read only once, when the charger is
-    created. A serial number that was not set before is the one it has read itself.
+    created. A fact that was not kept before is the one it has read itself.
     """
-    names = set(old.live)
-    if old.serial is None:
-        names.add("serial")
+    names = set(old.live) | {
+        name
+        for name, fact in old.facts.items()
+        if not fact.identifies or getattr(old, name) is None
+    }
     same = {name: getattr(old, name) for name in names}
     return type(old) is type(new) and replace(new, **same) == old

@@ -44,6 +44,9 @@ CONF_IDENTITY: Final = "identity"
 id."""
 CONF_SERIAL: Final = "serial"
 """Serial number as text, or None: then the first one read is stored."""
+CONF_REFUSED: Final = "refused"
+"""Serial number of a box that is set up with an older subentry, and was not accepted in
+the place of this one."""
 CONF_INSTALLATION_LIMIT: Final = "installation_limit"
 """A; of the first port, where a box has several."""
 CONF_PORTS: Final = "ports"
@@ -62,4 +65,4 @@ CONF_FAIL_SAFE_TIMEOUT: Final = "fail_safe_timeout"
 """s; used in the first orders of a charger only (EVBox)."""
 
 # What else is stored of a charger are the options of its protocol (`evse/options.py`),
-# each under its name.
+# and what was read of its box (`ChargerConfig.facts`), each under its name.

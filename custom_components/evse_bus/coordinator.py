@@ -197,7 +197,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         """Handle a changed reading, state or configuration of a charger."""
         charger = managed.charger
         self.all_chargers.store_address(managed)
-        self.all_chargers.store_serial(managed)
+        self.all_chargers.store_facts(managed)
         reading = charger.reading
         before = managed.connectors
         managed.connectors = (

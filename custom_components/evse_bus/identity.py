@@ -13,7 +13,13 @@ from homeassistant.core import callback
 from homeassistant.util.ulid import ulid_now
 
 from .configuration import charger_configs, initial_orders, protocol_of
-from .const import CONF_IDENTITY, CONF_PROTOCOL, CONF_SERIAL, DOMAIN
+from .const import (
+    CONF_IDENTITY,
+    CONF_PROTOCOL,
+    CONF_REFUSED,
+    CONF_SERIAL,
+    DOMAIN,
+)
 
 if TYPE_CHECKING:
     from homeassistant.config_entries import ConfigEntry, ConfigSubentry
@@ -41,8 +47,9 @@ def another_box(
 ) -> AnotherBox:
     """Return the subentry of a box that takes the place of another."""
     identity = protocol.identity(serial)
+    of_the_other = {CONF_REFUSED, *protocol.config.facts}
     data = {
-        **subentry.data,
+        **{key: one for key, one in subentry.data.items() if key not in of_the_other},
         CONF_ADDRESS: address,
         CONF_SERIAL: serial,
         # Never that of the box before, of which nothing may be known either.
@@ -62,10 +69,10 @@ def another_box_texts(protocol: Protocol, subentry: ConfigSubentry) -> dict[str,
     }
 
 
-def kept_identity(subentry: ConfigSubentry) -> dict[str, str]:
-    """Return the identity of a box that is set up, as part of its data."""
-    stored = subentry.data
-    return {CONF_IDENTITY: stored[CONF_IDENTITY]} if CONF_IDENTITY in stored else {}
+def kept_data(protocol: Protocol, subentry: ConfigSubentry) -> dict[str, Any]:
+    """Return what the data of a box says of that box, not of its use."""
+    names = {CONF_IDENTITY, CONF_REFUSED, *protocol.config.facts} - {CONF_SERIAL}
+    return {key: one for key, one in subentry.data.items() if key in names}
 
 
 def identity_of(subentry: ConfigSubentry) -> str:
@@ -118,7 +125,8 @@ def holders(hass: HomeAssistant, identity: str) -> list[Holder]:
 
 
 def _identities(protocol: Protocol, subentry: ConfigSubentry) -> set[str | None]:
-    return {identity_of(subentry), protocol.identity(subentry.data.get(CONF_SERIAL))}
+    serials = (subentry.data.get(key) for key in (CONF_SERIAL, CONF_REFUSED))
+    return {identity_of(subentry), *map(protocol.identity, serials)}
 
 
 @callback

@@ -26,7 +26,13 @@ from ..configuration import (
     protocol_of,
 )
 from ..connections import Connections
-from ..const import CONF_SERIAL, DOMAIN, LOGGER, SUBENTRY_CHARGER
+from ..const import (
+    CONF_REFUSED,
+    CONF_SERIAL,
+    DOMAIN,
+    LOGGER,
+    SUBENTRY_CHARGER,
+)
 from ..discovery import async_set_up_now
 from ..energy import TOTALS
 from ..evse.model import ChargerConfig, Fault, Orders
@@ -376,18 +382,21 @@ class BusChargers:
             data={**managed.subentry.data, CONF_ADDRESS: address},
         )
 
-    def store_serial(self, managed: ManagedCharger) -> None:
-        """Store the first serial number read: no other box is accepted from then on.
-
-        Also one that was not accepted: a restart knows then whose box it is.
-        """
+    def store_facts(self, managed: ManagedCharger) -> None:
+        """Store what was read of the box, where it differs from what is kept."""
         charger, subentry = managed.charger, managed.subentry
-        if subentry.data.get(CONF_SERIAL):
-            return
-        serial = charger.info.serial if charger.info is not None else None
-        if Fault.WRONG_CHARGER in charger.noticed:
-            serial = charger.other_serial
-        if serial is not None:
+        data = dict(subentry.data)
+        for name, text in charger.facts.items():
+            # After the first serial number no other box is accepted.
+            if not (charger.config.facts[name].identifies and data.get(name)):
+                data[name] = text
+        if Fault.WRONG_CHARGER not in charger.noticed:
+            if charger.available:
+                data.pop(CONF_REFUSED, None)
+        elif not data.get(CONF_SERIAL) and charger.other_serial is not None:
+            # A restart knows then whose box it is, and still accepts any other.
+            data[CONF_REFUSED] = charger.other_serial
+        if data != subentry.data:
             self._hass.config_entries.async_update_subentry(
-                self._entry, subentry, data={**subentry.data, CONF_SERIAL: serial}
+                self._entry, subentry, data=data
             )

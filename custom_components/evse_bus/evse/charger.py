@@ -170,6 +170,18 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         """Return the limits that no order may exceed now."""
 
     @property
+    def facts(self) -> Mapping[str, str]:
+        """Return what was read of the box and is kept, by `ChargerConfig.facts`.
+
+        Nothing of a box that was not accepted, or that is not known to be the right
+        one.
+        """
+        serial = self.info.serial if self.info is not None else None
+        if serial is None or Fault.WRONG_CHARGER in self.noticed:
+            return {}
+        return {"serial": serial}
+
+    @property
     def effective_orders(self) -> Orders:
         """Return the orders that count now, lifetime considered."""
         return expired(self.orders) if self.orders_expired else self.orders

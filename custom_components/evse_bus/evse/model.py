@@ -6,7 +6,7 @@ no value is made up for what is not on the wire, and 0 is always a measured 0.
 This module imports nothing of the project and nothing of Home Assistant.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from typing import ClassVar
@@ -409,6 +409,19 @@ class Limits:
 # -- Configuration ---------------------------------------------------------------
 
 
+@dataclass(frozen=True, slots=True)
+class Fact:
+    """Something that a charger reads of its box, kept with its configuration."""
+
+    load: Callable[[str], object]
+    """Return the value of the kept text; ``None``: it has no meaning any more."""
+    identifies: bool = False
+    """The first one read stays: another one is that of another box.
+
+    Otherwise the last one read is kept; it may change with the firmware.
+    """
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChargerConfig:
     """The configuration of one charger; protocols add their own fields."""
@@ -417,6 +430,8 @@ class ChargerConfig:
         {"name", "installation_limit", "voltage", "poll_interval", "order_lifetime"}
     )
     """Fields that a charger reads at each use: it can follow a change of these."""
+    facts: ClassVar[Mapping[str, Fact]] = {"serial": Fact(str, identifies=True)}
+    """Fields that `Charger.facts` has values for, once they were read."""
 
     key: str
     """Identifies the charger for as long as it is configured; not its address."""

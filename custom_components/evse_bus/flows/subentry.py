@@ -25,7 +25,7 @@ from ..const import (
 )
 from ..evse.errors import NotAvailableError
 from ..evse.scan import Address, ScanResult
-from ..identity import another_box, another_box_texts, kept_identity
+from ..identity import another_box, another_box_texts, kept_data
 from .address import Errors, another_form, typed_addresses
 from .charger import (
     charger_data,
@@ -181,7 +181,9 @@ class ChargerSubentryFlow(
                     entry,
                     subentry,
                     title=user_input[CONF_NAME].strip(),
-                    data=data | kept_identity(subentry) | _fail_safe(stored, data),
+                    data=data
+                    | kept_data(self.protocol, subentry)
+                    | _fail_safe(stored, data),
                 )
         form = charger_form(
             self.protocol, ask_address=True, ask_serial=known is None, new=False

@@ -1,11 +1,17 @@
 """The configuration of a SmartEVSE, as entered by the user."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
-from ..model import ChargerConfig
+from ..model import ChargerConfig, Fact
 from .balancing import SLAVES
 from .dialects import UNITS, Dialect
+
+
+def _dialect(text: str) -> Dialect | None:
+    """Return a kept dialect; ``None``: a later version knew more of them."""
+    return Dialect(text) if text in Dialect else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -15,10 +21,16 @@ class SmartEvseConfig(ChargerConfig):
     Raises ValueError for an address that no box has.
     """
 
+    facts: ClassVar[Mapping[str, Fact]] = {
+        **ChargerConfig.facts,
+        "dialect": Fact(_dialect),
+    }
+
     poll_interval: float = 2.0
     """s; longer for a polled box of a later dialect, see `polled.QUIET`."""
     dialect: Dialect | None = None
-    """``None``: found by probing after each connect."""
+    """The one that was found last. It is what to expect until the box was probed, as
+    it is after each connect; ``None``: it never was."""
 
     def __post_init__(self) -> None:
         """Check the address."""

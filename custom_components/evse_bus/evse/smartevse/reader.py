@@ -5,7 +5,7 @@ known, and a serial number that it reports is the expected one. Each turn has on
 exchange at most, so that the broadcast of a master waits for one only. PROTOCOLS.md, 3.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from math import inf
 from typing import ClassVar, Final, override
@@ -139,6 +139,14 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
         return LONGEST_REQUEST
 
     @property
+    @override
+    def facts(self) -> Mapping[str, str]:
+        if self.dialect is None or self.status is None:
+            # Its serial number, if it has one, was not compared yet.
+            return super().facts
+        return {**super().facts, "dialect": self.dialect.value}
+
+    @property
     def known_dialect(self) -> Dialect:
         """Return the dialect; raises NotAvailableError before it is known."""
         if self.dialect is None:
@@ -179,7 +187,7 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
             await rest()
 
     async def _identify(self, turn: Turn) -> None:
-        """Find the dialect, unless it is configured; raises as `reach`."""
+        """Find the dialect, which may have changed; raises as `reach`."""
 
         async def read(block: Block) -> bytes:
             if block != PROBE_A0:
@@ -194,7 +202,7 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
                 raise
 
         try:
-            dialect = self.config.dialect or await find_dialect(read)
+            dialect = await find_dialect(read)
         except ImplausibleReplyError:
             self.notice(Fault.UNSUPPORTED_FIRMWARE, present=True)
             raise
