@@ -69,8 +69,7 @@ class Nodes:
         maximum = words[7 if has_word_7 else 2] if len(words) > 7 else 0
         sharing.maxima[unit - 1] = 10 * maximum
         self._charge(unit, now, charging=node.state == "C")
-        if node.state in ("A", "B1", "C1"):
-            sharing.currents[unit - 1] = 0
+        # The value of one that has left stays as it was.
 
     def _charge(self, unit: int, now: float, *, charging: bool) -> None:
         node = self._nodes[unit]

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from tests.simulated_client import living, wait
+
+from .bus import VirtualBus
 from .car import Car
+from .smartevse import SmartEvse
 from .smartevse_alone import SmartEvseAlone
 from .smartevse_frames import frame, read_frame, write_several_frame
 
@@ -204,3 +208,48 @@ def test_head_searches_for_the_smallest_current_of_each_car() -> None:
         assert seen == [13.0, 6.0, 8.0, 6.0, 8.0, 6.0, 8.0, 7.0]
         car.leave()
         alone.live(5)
+
+
+@pytest.mark.parametrize("dialect", ["2.20", "2.30", "2.30+", "3-serkri", "3"])
+def test_nodes_and_their_master_on_the_wire(dialect: str) -> None:
+    cars = [Car(), Car(), Car()]
+    nodes = [
+        SmartEvse(dialect, load_balance=unit, car=car, cable=32, max_current=32)
+        for unit, car in zip((2, 5, 8), cars, strict=True)
+    ]
+    master = SmartEvse(dialect, load_balance=1, settings={"circuit": 16})
+    with living(VirtualBus.in_loop(master, *nodes)) as bus:
+        bus.wait_for(lambda: all(node.broadcasts for node in nodes))
+        for car in cars[:2]:
+            car.plug_in()
+        bus.wait_for(lambda: all(node.contactor for node in nodes[:2]), 24)
+        if dialect != "2.30+":
+            # That one searches for the smallest current of the cars first.
+            bus.wait_for(lambda: nodes[0].pilot_current == 8.0, 4)
+        cars[2].plug_in()
+        bus.wait_for(lambda: nodes[2].error == 1, 24)
+        assert sum(node.pilot_current for node in nodes) <= 16.0
+        assert {unit for _, unit, _ in master.controller.nodes.granted} == {2, 5}
+        cars[0].leave()
+        # Refused for a minute from then on.
+        bus.wait_for(lambda: nodes[2].error == 0, 6)
+        wait(bus, 40)
+        assert not nodes[2].contactor
+        bus.wait_for(lambda: nodes[2].contactor, 40)
+
+
+@pytest.mark.parametrize(("late", "before"), [(1, 0), (1, 1), (0, 0)])
+def test_an_answer_waits_for_the_cable_measurement(late: int, before: int) -> None:
+    """As recorded: some 0.1 s late, with the state after it or before it."""
+    car = Car()
+    node = SmartEvse("2.30", load_balance=2, car=car, late_answers=bool(late))
+    node.controller.answers_as_before = bool(before)
+    with living(VirtualBus.in_loop(node, tick=0.01)) as bus:
+        bus.inject(write_several_frame(9, 0x20, *[0] * 8))
+        car.plug_in()
+        begin = bus.time()
+        bus.inject(read_frame(2, 0, 1), after=0.04)
+        wait(bus, 0.5)
+        (reply,) = bus.log.of(node.name)
+        assert reply.data[4] == (4 if late and not before else 0)
+        assert (0.08 < reply.t - begin < 0.15) == bool(late)
