@@ -241,15 +241,29 @@ def _evbox(add: Callable[..., object]) -> None:
     add("--ignore-limit", action="store_true", help="takes orders without effect")
 
 
+def _setting(text: str) -> tuple[str, int]:
+    """Return name and value of a stored setting."""
+    name, _, value = text.partition("=")
+    return name, int(value)
+
+
 def _smartevse(add: Callable[..., object]) -> None:
-    add("--dialect", choices=list(DIALECTS), default="2.17", help="the firmware")
+    add(
+        "--dialect",
+        nargs="+",
+        choices=list(DIALECTS),
+        default=["2.17"],
+        help="the firmware, for each box; 2.30+: the development version after 2.30;"
+        " 3.00 to 3: five lines of 3.x, of which 3 is the newest",
+    )
     add(
         "--load-balance",
         type=int,
         nargs="+",
         default=[0],
         metavar="N",
-        help="for each box: 0 off, 1 master, 2 to 8 slaves; also its address",
+        help="for each box: 0 off (polled), 1 master, 2 to 8 slaves or nodes; also its"
+        " address. A 3.x answers as a node only",
     )
     add(
         "--unit",
@@ -277,6 +291,15 @@ def _smartevse(add: Callable[..., object]) -> None:
         help="of the first box; from 2.30 on",
     )
     add("--no-override", action="store_true", help="takes a current without effect")
+    add(
+        "--set",
+        type=_setting,
+        nargs="+",
+        default=[],
+        metavar="NAME=N",
+        help="other stored settings, as in the menu: mains_meter=1 lets a 3.x with load"
+        " balancing off ask its meter every 2 s",
+    )
     add("--turn-round", type=float, default=0.01, metavar="S", help="before a reply")
 
 

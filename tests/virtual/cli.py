@@ -231,11 +231,11 @@ def _evbox(options: argparse.Namespace) -> list[Device]:
 
 def _smartevse(options: argparse.Namespace) -> list[Device]:
     boxes: list[Device] = []
-    cables = options.cables
+    cables, dialects = options.cables, options.dialect
     for index, load_balance in enumerate(options.load_balance):
         boxes.append(
             SmartEvse(
-                options.dialect,
+                dialects[min(index, len(dialects) - 1)],
                 load_balance=load_balance,
                 car=_car(options, index),
                 config="fixed" if options.fixed_cable else "socket",
@@ -246,6 +246,7 @@ def _smartevse(options: argparse.Namespace) -> list[Device]:
                 serial=options.serial + index,
                 unit=options.unit,
                 override_works=not options.no_override,
+                settings=dict(options.set),
                 turn_round=options.turn_round,
             )
         )

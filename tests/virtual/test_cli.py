@@ -126,6 +126,20 @@ def test_smartevse_dialects() -> None:
         assert client.read(7)[:5].hex() == "010302004d"
 
 
+def test_smartevse_nodes_of_several_dialects() -> None:
+    """A 3.x answers as a node only; each box has its own firmware."""
+    arguments = ["--dialect", "2.30", "2.30+", "3", "--load-balance", "2", "3", "8"]
+    arguments += ["--cars", "plugged", "--set", "circuit=20"]
+    with (
+        running("smartevse", *arguments) as (_, url),
+        RawClient(url, "N", termios.B9600) as client,
+    ):
+        # The stored circuit limit of each.
+        for request in ("0204020100016181", "0304020100016050", "080402010001612b"):
+            client.write(bytes.fromhex(request))
+            assert client.read(7)[1:5].hex() == "04020014"
+
+
 def test_drivers_at_an_ews_box() -> None:
     arguments = ["--cars", "plugged", "--drivers", "--time-scale", "8"]
     with running("ews", *arguments) as (_, url), EwsClient.serial(url) as client:
