@@ -7,7 +7,7 @@ import pytest
 from custom_components.evse_bus.evse.model import OrderChange
 from custom_components.evse_bus.evse.smartevse.master import PERIOD
 from tests.evse.smartevse.frames import REQUEST_A, REQUEST_C, answers, frame
-from tests.evse.smartevse.scene import MasterScene
+from tests.evse.smartevse.scene import BYTE, MasterScene, Sent
 from tests.simulated_time import now, simulate
 
 TO_STATE_B = "02060084"
@@ -45,6 +45,31 @@ def test_answered_in_time_during_a_time_out() -> None:
             (answer,) = answers(scene, asked)
             # The time-out is 0.25 s, and counted from the end of the request.
             assert answer.when - asked < 0.45
+
+    simulate(scene())
+
+
+@pytest.mark.parametrize("silence", [0.0062, 0.008, 0.009, 0.0095, 0.0105])
+def test_a_request_after_a_broadcast_does_not_collide(silence: float) -> None:
+    """Boxes detect a silence of 6 ms some milliseconds later, each in its own time."""
+
+    async def scene() -> None:
+        async with MasterScene(units=(2, 3)) as scene:
+            await asyncio.sleep(6)
+            line = scene.line
+            asked: list[float] = []
+
+            def ask(sent: Sent) -> None:
+                if sent.is_broadcast and not asked:
+                    asked.append(sent.when + len(sent.data) * BYTE + silence)
+                    line.loop.call_at(asked[0], line.send, REQUEST_A)
+
+            line.on_sent = ask
+            # A reading is due, too: it comes right after the broadcast.
+            scene.slave(3).read_soon(scene.master.slot.ready)
+            await asyncio.sleep(PERIOD + 0.5)
+            (answer,) = answers(scene, asked[0])
+            assert answer.when - asked[0] < 0.1
 
     simulate(scene())
 

@@ -64,8 +64,9 @@ MASTER: Final = Protocol(
     make=_MAKE,
     choice="master",
     settings=SETTINGS,
-    # A reply must leave room for the broadcast every 2 s.
-    timing=replace(TIMING, reply_timeout_limit=0.6),
+    # A reply must leave room for the broadcast every 2 s. A box that requests something
+    # begins after 6 to 10 ms of silence, and is received 1 ms later: it goes first.
+    timing=replace(TIMING, silence=0.012, reply_timeout_limit=0.6),
     framer=RtuFramer,
     config=SlaveConfig,
     charger=SlaveSmartEvse,
