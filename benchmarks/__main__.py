@@ -5,6 +5,7 @@ import asyncio
 import json
 import sys
 import traceback
+from types import ModuleType
 from typing import Final
 
 from . import (
@@ -60,7 +61,8 @@ def main() -> int:
         report(f"-- {name}")
         methods[name] = benchmark.METHOD
         try:
-            figures += asyncio.run(benchmark.run(quick=options.quick))
+            more = {one: getattr(options, one) for one in _options_of(benchmark)}
+            figures += asyncio.run(benchmark.run(quick=options.quick, **more))
         except Exception:  # noqa: BLE001 - the figures of the others still count
             traceback.print_exc()
             failed.append(name)
@@ -77,6 +79,11 @@ def main() -> int:
     return bool(failed)
 
 
+def _options_of(benchmark: ModuleType) -> tuple[str, ...]:
+    """Return the options that a benchmark takes beside `quick`."""
+    return getattr(benchmark, "OPTIONS", ())
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="scripts/bench",
@@ -86,6 +93,15 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("names", nargs="*", choices=BENCHMARKS, metavar="NAME")
     parser.add_argument(
         "--quick", action="store_true", help="a short run: rough figures in 15 minutes"
+    )
+    parser.add_argument(
+        "--minutes", type=float, help="length of each scene of smartevse-master"
+    )
+    parser.add_argument(
+        "--scene",
+        default="",
+        metavar="TEXT",
+        help="only scenes with this in their names, of smartevse-master or byte-errors",
     )
     return parser
 

@@ -5,6 +5,8 @@ All times are seconds of CLOCK_MONOTONIC, all currents amperes.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from math import inf
 from typing import Final
 
 from tests.virtual.smartevse_frames import (
@@ -21,10 +23,18 @@ from .oracle import LoggedFrame
 
 PERIOD: Final = 2.0
 """Between two broadcasts."""
+BROADCASTS: Final = {(0, 0x0001), (9, 0x0001), (9, 0x0020)}
+"""Unit and register of the broadcasts of currents: of 2.17, of 2.20, of 2.30 on."""
+STATUS: Final = {0x00A0, 0x0000}
+"""The first register of a status, which is the state."""
+ASKS: Final = {4: "B", 6: "C"}
+"""States of a node that waits for its master's answer, from 2.20 on."""
 EARLY: Final = 0.001
 """A broadcast this early still counts as the one that is due."""
 REPEATS: Final = 1.0
 """An unanswered request is repeated after this."""
+SAME_REQUEST: Final = 1.4
+"""After a longer time it is another request, not a repetition."""
 PENDING_REPLY: Final = 0.012
 """Time after a request within which another box may still send a pending reply."""
 SAME_MOMENT: Final = 0.005
@@ -48,8 +58,8 @@ def broadcasts(log: Iterable[LoggedFrame]) -> list[float]:
         for frame in log
         if frame.from_client
         and (packet := _packet(frame)) is not None
-        and (packet.unit, packet.function) == (0, WRITE_SEVERAL)
-        and packet.register == 1
+        and packet.function == WRITE_SEVERAL
+        and (packet.unit, packet.register) in BROADCASTS
     ]
 
 
@@ -135,6 +145,151 @@ def _reply(
     return None
 
 
+# -- What a box asks for, in any dialect -----------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Ask:
+    """A box that waits for its master, from the first time it said so."""
+
+    unit: int
+    kind: str
+    since: float
+    answered: float | None
+    """Start of the answer; ``None``: none before it gave up, or the log ended."""
+    until: float
+    """When it was answered, gave up, or the log ended."""
+
+    @property
+    def waited(self) -> float:
+        """Return how long it has waited, s."""
+        return self.until - self.since
+
+
+def repeated(made: Iterable[SlaveRequest], end: float) -> list[Ask]:
+    """Return the requests of 2.17, each with its repetitions, up to ``end``."""
+    found: list[Ask] = []
+    waiting: dict[tuple[int, int], tuple[float, float]] = {}
+    for one in made:
+        key = (one.unit, one.register)
+        first, last = waiting.pop(key, (one.end, one.end))
+        if one.end - last > SAME_REQUEST:
+            found.append(_ask(*key, first, None, last))
+            first = one.end
+        if one.replied is None:
+            waiting[key] = (first, one.end)
+        else:
+            found.append(_ask(*key, first, one.replied, one.replied))
+    for key, (first, last) in waiting.items():
+        until = end if end - last < SAME_REQUEST else last
+        found.append(_ask(*key, first, None, until))
+    return found
+
+
+def _ask(
+    unit: int, register: int, since: float, answered: float | None, until: float
+) -> Ask:
+    return Ask(unit, f"{register:02d}", since, answered, until)
+
+
+def asked_by_state(log: Iterable[LoggedFrame], end: float) -> list[Ask]:
+    """Return how long nodes were left in a state in which they wait, up to ``end``."""
+    found: list[Ask] = []
+    waiting: dict[int, tuple[int, float]] = {}
+    for unit, packet, frame in _conversations(log):
+        state, since = waiting.get(unit, (0, 0.0))
+        if packet.kind != "answer":
+            writes = packet.function in (WRITE_ONE, WRITE_SEVERAL)
+            if writes and packet.register in STATUS and state:
+                del waiting[unit]
+                found.append(Ask(unit, ASKS[state], since, frame.start, frame.start))
+            continue
+        told = int.from_bytes(frame.data[3:5], "big")
+        if told == state:
+            continue
+        if state:
+            # The car has left, or an error has ended it.
+            del waiting[unit]
+            found.append(Ask(unit, ASKS[state], since, None, frame.end))
+        if told in ASKS:
+            waiting[unit] = (told, frame.end)
+    found.extend(
+        Ask(unit, ASKS[state], since, None, end)
+        for unit, (state, since) in waiting.items()
+    )
+    return found
+
+
+def _conversations(
+    log: Iterable[LoggedFrame],
+) -> Iterable[tuple[int, Packet, LoggedFrame]]:
+    """Return our requests to single boxes, and the replies to reads of a status."""
+    read = 0
+    for frame in log:
+        packet = None if frame.collided else _packet(frame)
+        if packet is None:
+            continue
+        if frame.from_client:
+            is_read = packet.function in READS and packet.register in STATUS
+            read = packet.unit if is_read else 0
+            yield packet.unit, packet, frame
+        elif packet.unit == read and packet.function in READS:
+            read = 0
+            yield packet.unit, packet, frame
+
+
+# -- Readings --------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """One reading of a status."""
+
+    unit: int
+    start: float
+    end: float | None
+    """End of the reply; ``None``: there was none."""
+
+
+def readings(log: Iterable[LoggedFrame]) -> list[Reading]:
+    """Return all readings of a status."""
+    found: list[Reading] = []
+    for unit, packet, frame in _conversations(log):
+        if packet.kind == "answer":
+            found[-1] = Reading(unit, found[-1].start, frame.end)
+        elif packet.function in READS and packet.register in STATUS:
+            found.append(Reading(unit, frame.start, None))
+    return found
+
+
+def rounds(
+    due: Sequence[float], made: Sequence[Reading], units: Iterable[int]
+) -> tuple[list[float], int]:
+    """Return how long rounds took, and how often a box was left out of one.
+
+    A round lasts from a due broadcast until each of the ``units`` was read.
+    """
+    lengths: list[float] = []
+    left_out = 0
+    units = set(units)
+    at = 0
+    for begin, next_one in pairwise(due):
+        while at < len(made) and made[at].start < begin:
+            at += 1
+        missing = set(units)
+        last = begin
+        for poll in made[at:]:
+            if poll.start >= next_one or not missing:
+                break
+            if poll.end is not None and poll.unit in missing:
+                missing.discard(poll.unit)
+                last = poll.end
+        left_out += len(missing)
+        if not missing:
+            lengths.append(last - begin)
+    return lengths, left_out
+
+
 # -- The sum of all offers -------------------------------------------------------
 
 
@@ -154,6 +309,8 @@ class Sums:
     """The highest sum."""
     violations: int
     """Number of rises above the supply."""
+    seconds: float
+    """Time above it after such a rise, s."""
     longest: float
     """Longest time above a supply that was lowered."""
 
@@ -163,34 +320,62 @@ def sums(offers: Iterable[Offer], shared: Iterable[Shared], end: float) -> Sums:
     changes: list[Offer | Shared] = [*offers, *shared]
     changes.sort(key=lambda change: change.at)
     now: dict[str, float] = {}
-    limit = most = total = longest = 0.0
-    lowered = above = None
-    violations = 0
+    sum_ = _Sum()
     for index, change in enumerate(changes):
-        before = total
         if isinstance(change, Shared):
-            if change.amps < limit:
-                lowered = change.at
-            limit = change.amps
-        else:
-            now[change.name] = change.amps if change.closed else 0.0
-            if index + 1 < len(changes) and (
-                changes[index + 1].at - change.at < SAME_MOMENT
-                and isinstance(changes[index + 1], Offer)
-            ):
-                continue
-        total = sum(now.values())
-        most = max(most, total)
-        if total <= limit + ROUNDING:
-            if above is not None:
-                longest = max(longest, change.at - above)
-            above = None
+            sum_.share(change)
             continue
-        if above is None:
-            above = change.at
-        in_flight = lowered is not None and change.at - lowered < IN_FLIGHT
-        if isinstance(change, Offer) and total > before + ROUNDING and not in_flight:
-            violations += 1
-    if above is not None:
-        longest = max(longest, end - above)
-    return Sums(most, violations, longest)
+        now[change.name] = change.amps if change.closed else 0.0
+        if index + 1 < len(changes) and (
+            changes[index + 1].at - change.at < SAME_MOMENT
+            and isinstance(changes[index + 1], Offer)
+        ):
+            continue
+        sum_.change(sum(now.values()), change.at)
+    sum_.end(end)
+    return Sums(sum_.most, sum_.violations, sum_.seconds, sum_.longest)
+
+
+class _Sum:
+    """The sum of the offers against the supply, as time goes on."""
+
+    def __init__(self) -> None:
+        self.most = self.seconds = self.longest = 0.0
+        self.violations = 0
+        self._total = self._limit = 0.0
+        self._lowered = -inf
+        self._above: float | None = None
+        """Since when it is above the supply, for whatever reason."""
+        self._risen: float | None = None
+        """Since when it is above because it rose."""
+
+    def share(self, shared: Shared) -> None:
+        """Follow another supply."""
+        if shared.amps < self._limit:
+            self._lowered = shared.at
+        self._limit = shared.amps
+        self._look(shared.at)
+
+    def change(self, total: float, at: float) -> None:
+        """Follow another sum."""
+        before, self._total = self._total, total
+        self.most = max(self.most, total)
+        self._look(at)
+        in_flight = at - self._lowered < IN_FLIGHT
+        if self._above is not None and total > before + ROUNDING and not in_flight:
+            self.violations += 1
+            self._risen = at if self._risen is None else self._risen
+
+    def end(self, at: float) -> None:
+        """End the evaluation."""
+        if self._above is not None:
+            self.longest = max(self.longest, at - self._above)
+        if self._risen is not None:
+            self.seconds += at - self._risen
+        self._above = self._risen = None
+
+    def _look(self, at: float) -> None:
+        if self._total <= self._limit + ROUNDING:
+            self.end(at)
+        elif self._above is None:
+            self._above = at

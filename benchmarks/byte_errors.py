@@ -24,6 +24,7 @@ from .watched_smartevse import PolledScene, SlaveScene
 from .witness import Findings
 
 NAME = "byte-errors"
+OPTIONS: Final = ("scene",)
 RATE: Final = 1e-3
 CURRENTS: Final = (6.0, 8.0, 10.0, 12.5, 14.0, 16.0)
 FORBIDS: Final = 0.15
@@ -89,10 +90,10 @@ CASES: Final = {
 }
 
 
-async def run(*, quick: bool) -> list[Figure]:
-    """Return the figures."""
+async def run(*, quick: bool, scene: str = "") -> list[Figure]:
+    """Return the figures of the scenes whose name has ``scene`` in it."""
     seconds = HOUR if quick else DAY
-    cases = [Case(name, make, seconds) for name, make in CASES.items()]
+    cases = [Case(name, make, seconds) for name, make in CASES.items() if scene in name]
     report(f"{len(cases)} scenes of {seconds / HOUR:g} h")
     outcomes = await simulate_all(watch, cases)
     figures: list[Figure] = []

@@ -197,7 +197,8 @@ def _offers(bus: Buses) -> object:
     return [(one.at, one.name, one.amps, one.closed) for one in offers]
 
 
-def _log(bus: Buses, since: float) -> object:
+def logged(bus: Buses, since: float = 0.0) -> list[LoggedFrame]:
+    """Return the frames on the wire from a time on."""
     entries = [
         entry
         for one in buses_of(bus)
@@ -208,15 +209,18 @@ def _log(bus: Buses, since: float) -> object:
     ]
     entries.sort(key=lambda entry: entry.t)
     return [
-        (
-            entry.t,
-            entry.end,
-            entry.source == CLIENT,
-            entry.data.hex(),
-            entry.collided,
+        LoggedFrame(
+            entry.t, entry.end, entry.source == CLIENT, entry.data, entry.collided
         )
         for entry in entries
         if entry.t >= since
+    ]
+
+
+def _log(bus: Buses, since: float) -> object:
+    return [
+        (one.start, one.end, one.from_client, one.data.hex(), one.collided)
+        for one in logged(bus, since)
     ]
 
 

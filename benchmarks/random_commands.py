@@ -13,8 +13,6 @@ from custom_components.evse_bus.evse.model import Circuit, OrderChange
 
 from .balancing import Shared
 
-SUPPLIES: Final = (12.0, 16.0, 20.0, 25.0, 32.0)
-"""A; each is enough for the minimum of two boxes."""
 CURRENTS: Final = (6.0, 8.0, 10.0, 12.5, 14.0, 16.0)
 FORBIDS: Final = 0.1
 """Share of commands that pause a charger; the next one allows it to charge again."""
@@ -32,6 +30,8 @@ class RandomCommands:
     chargers: Sequence[Charger]
     shared: list[Shared]
     """The supplies that were shared, by time."""
+    supplies: Sequence[float]
+    """Supplies to choose from, A."""
     dice: Random
     given: int = 0
     refused: list[str] = field(default_factory=list)
@@ -57,7 +57,7 @@ class RandomCommands:
         elif kind < FORBIDS:
             change = OrderChange(allowed=False)
         elif kind < FORBIDS + SHARES:
-            await self.share(self.dice.choice(SUPPLIES))
+            await self.share(self.dice.choice(self.supplies))
             return
         else:
             change = OrderChange(current=self.dice.choice(CURRENTS))

@@ -2,30 +2,33 @@
 
 import asyncio
 from collections.abc import Sequence
-from math import inf
+from dataclasses import replace
 from random import Random
 from statistics import fmean
 from typing import Final
 
 from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.model import Circuit, OrderChange
-from custom_components.evse_bus.evse.smartevse.master import SLACK
 
 from .balancing import (
+    PERIOD,
     REPEATS,
-    Shared,
     SlaveRequest,
+    asked_by_state,
     broadcasts,
     longest_silence,
     on_plan,
+    readings,
+    repeated,
     requests,
+    rounds,
     sums,
 )
 from .figures import Figure, gaps, percentile
+from .master_scene import MasterScene, Seen, at_real_pace, in_simulated_time
 from .offers import Offer
 from .oracle import Oracle
 from .progress import report
-from .random_commands import RandomCommands
 from .set_points import (
     HIGH,
     LOW,
@@ -37,100 +40,115 @@ from .set_points import (
     until_all_charge,
 )
 from .setup import master_bus, settled
+from .simulated import HOUR, simulate_all
 
 NAME = "smartevse-master"
+OPTIONS: Final = ("minutes", "scene")
 METHOD = """\
-Two virtual SmartEVSEs (2.17, slaves 2 and 3) in a process of their own on a pty paced
-at 9600 8N1, each polled every 2 s; library alone. Their cars come, wait, charge and
-leave by themselves; meanwhile currents (6 to 16 A), permissions and the shared supply
-(12 to 32 A) change at random moments, 1 s apart on average. Then the same with one of
-them dead, and then, with both cars charging all the time and 32 A to share, set-points
-alone; at last 22 A to share, where one goes up only after the other has gone down. All
-times are from the virtual bus's log and from the boxes' own records. Deviation: of a
-broadcast from a grid of exactly 2 s, read once from the library at the beginning;
-broadcasts between, sent because of a change, do not count as late or early. Answer:
-from the time the bus is idle after a box's request to the first byte of our reply.
-Offered: the pilot of the box has the new current."""
+Virtual SmartEVSEs of one family, each polled every 2 s, in a process of their own on a
+pty paced at 9600 8N1; library alone. Their cars come, wait, charge and leave by
+themselves; meanwhile currents (6 to 16 A), permissions and the shared supply (some of
+them too little for all) change at random moments, 1 s apart on average. Then the same
+with one of them dead, and for some hours in simulated time. Then, with both cars of two
+boxes charging all the time and 32 A to share, set-points alone; at last 22 A to share,
+where one goes up only after the other has gone down. All times are from the virtual
+bus's log and from the boxes' own records. Deviation: of a broadcast from a grid of
+exactly 2 s, read once from the library at the beginning; broadcasts between, sent
+because of a change, do not count as late or early. Answer: from the time the bus is idle
+after a box's request (2.17), or from the end of the reading that shows its wish (later
+ones), to the first byte of our reply. Round: from a due broadcast until each box was
+read. Offered: the pilot of the box has the new current."""
 
-UNITS: Final = (2, 3)
-SUPPLY: Final = 32.0
-LIFE: Final = {
-    "away": [1.0, 8.0],
-    "hesitates": [0.0, 4.0],
-    "wants_wh": [5.0, 60.0],
-    "stays": [1.0, 6.0],
-}
-"""The lives of the cars: a charge takes less than a minute."""
+TWO_17: Final = MasterScene(
+    "2.17 x3", ("2.17",) * 3, (32.0, 12.0, 16.0, 20.0, 25.0, 48.0)
+)
+SCENES: Final = (
+    TWO_17,
+    replace(TWO_17, name="2.17 x3, one dead", dead=True),
+)
+MINUTES: Final = 10.0
+"""Of each scene; one with a dead box takes a fifth of it."""
+SHORT: Final = 1 / 3
+SIMULATED: Final = 2 * HOUR
 SEED: Final = 3
+SUPPLY: Final = 32.0
 FOLLOWED: Final = 3.0
 """Time after which all boxes have their new share, s."""
 TOO_LONG: Final = 5.0
 """Longest time allowed without a broadcast, s."""
+SET_POINTS: Final = "set-points"
 
 
-async def run(*, quick: bool) -> list[Figure]:
-    """Return the figures."""
-    report("two slaves with cars that come and go")
-    both = await _busy(20.0 if quick else 600.0)
-    report("the same with one of them dead")
-    one = await _busy(20.0 if quick else 120.0, dead=True)
-    report("set-points")
-    return [*both, *one, *await _set_points(10 if quick else 100)]
+async def run(
+    *, quick: bool, minutes: float | None = None, scene: str = ""
+) -> list[Figure]:
+    """Return the figures; ``minutes`` of each scene whose name has ``scene`` in it."""
+    scenes = [one for one in SCENES if scene in one.name]
+    figures: list[Figure] = []
+    for one in scenes:
+        length = minutes or (SHORT if quick else MINUTES)
+        seconds = 60 * length / (5 if one.dead else 1)
+        report(f"{one.name}, {seconds:.0f} s")
+        figures += _figures(one, await at_real_pace(one, seconds))
+    alive = [one for one in scenes if not one.dead]
+    report(f"{len(alive)} scenes in simulated time")
+    cases = [(one, HOUR / 6 if quick else SIMULATED) for one in alive]
+    for some in await simulate_all(_simulated, cases):
+        figures += some
+    if scene in SET_POINTS:
+        report("set-points")
+        figures += await _set_points(10 if quick else 100)
+    return figures
+
+
+async def _simulated(case: tuple[MasterScene, float]) -> list[Figure]:
+    scene, seconds = case
+    name = f"{scene.name}, {seconds / HOUR:.1f} h simulated"
+    return _figures(replace(scene, name=name), await in_simulated_time(*case))
 
 
 # -- A busy bus ------------------------------------------------------------------
 
 
-async def _busy(seconds: float, *, dead: bool = False) -> list[Figure]:
-    boxes = [
-        {
-            "load_balance": unit,
-            "cable": 32,
-            "max_current": 32,
-            "car": LIFE | {"seed": s},
-        }
-        for s, unit in enumerate(UNITS)
-    ]
-    loop = asyncio.get_running_loop()
-    async with Oracle("smartevse", boxes=boxes) as oracle:
-        bus = master_bus(oracle.url, UNITS, SUPPLY)
-        chargers = list(bus.chargers.values())
-        shared = [Shared(loop.time(), SUPPLY)]
-        await bus.start()
-        try:
-            await settled(bus)
-            if dead:
-                await oracle.kill([chargers[1].config.key])
-                del chargers[1]
-            begin = await _plan(bus)
-            commands = RandomCommands(bus, chargers, shared, Random(SEED))  # noqa: S311
-            await commands.run(seconds)
-            end = loop.time()
-        finally:
-            await bus.stop()
-        log = [frame for frame in await oracle.log(begin - 1.0) if frame.start <= end]
-        offers = [offer for offer in await oracle.offers() if offer.at <= end]
-    times = [time for time in broadcasts(log) if time >= begin - 1.0]
-    prefix = "one dead: " if dead else ""
-    figures = [
+def _figures(scene: MasterScene, seen: Seen) -> list[Figure]:
+    begin, end = seen.given.begin, seen.given.end
+    times = [time for time in broadcasts(seen.log) if time >= begin - 1.0]
+    made = requests(seen.log)
+    asks = [*repeated(made, end), *asked_by_state(seen.log, end)]
+    late = [one for one in asks if one.since > begin and one.waited > PERIOD]
+    waited = [one.waited for one in asks if one.answered is not None] or [0.0]
+    kinds = sorted({one.kind for one in asks})
+    counted = ", ".join(
+        f"{kind}: {sum(one.kind == kind for one in asks)}" for kind in kinds
+    )
+    # Requests at the very end had no time for a reply.
+    in_time = [one for one in made if begin < one.end < end - REPEATS]
+    prefix = f"{scene.name}: "
+    return [
         *_punctuality(prefix, times, begin, end),
-        *_safety(prefix, offers, shared, end),
-        _given(prefix, commands),
+        *_readings(prefix, scene, times, seen),
+        *_safety(prefix, seen),
+        _count(
+            f"{prefix}boxes left without an answer for more than {PERIOD:.0f} s",
+            len(late),
+            note=f"of {len(asks)} ({counted}); longest {max(waited):.2f} s",
+        ),
+        _milliseconds(
+            f"{prefix}box's wish to its answer, p50", percentile(waited, 0.5)
+        ),
+        _milliseconds(
+            f"{prefix}box's wish to its answer, p99", percentile(waited, 0.99)
+        ),
+        *_answers(prefix, in_time),
+        _given(prefix, seen),
+        Figure(
+            NAME,
+            f"{prefix}processor time",
+            100 * seen.given.processor / (end - begin),
+            "%",
+            note="of one core; where simulated, with the boxes",
+        ),
     ]
-    if not dead:
-        # Requests at the very end had no time for a reply.
-        made = [one for one in requests(log) if begin < one.end < end - REPEATS]
-        figures[-1:-1] = _answers(made)
-    return figures
-
-
-async def _plan(bus: Bus) -> float:
-    """Return the time of a due broadcast, once there are any."""
-    async with asyncio.timeout(10.0):
-        while True:
-            if bus.master is not None and bus.master.slot.start_by < inf:
-                return bus.master.slot.start_by - SLACK
-            await asyncio.sleep(0.1)
 
 
 def _punctuality(
@@ -142,11 +160,13 @@ def _punctuality(
     silence = longest_silence(times, end)
     between = len(times) - len(due)
     return [
-        _milliseconds(f"{prefix}interval, min", min(intervals), note=f"{len(due)} due"),
-        _milliseconds(f"{prefix}interval, mean", fmean(intervals)),
-        _milliseconds(f"{prefix}interval, p99", percentile(intervals, 0.99)),
-        _milliseconds(f"{prefix}interval, max", max(intervals)),
-        _milliseconds(f"{prefix}deviation from the plan, mean", fmean(off)),
+        _milliseconds(
+            f"{prefix}interval, max",
+            max(intervals),
+            note=f"{len(due)} due; mean {fmean(intervals) * 1000:.1f} ms,"
+            f" min {min(intervals) * 1000:.1f} ms",
+        ),
+        _milliseconds(f"{prefix}deviation from the plan, p50", percentile(off, 0.5)),
         _milliseconds(
             f"{prefix}deviation from the plan, p99", percentile(off, 0.99), 50
         ),
@@ -159,44 +179,77 @@ def _punctuality(
     ]
 
 
-def _answers(made: Sequence[SlaveRequest]) -> list[Figure]:
-    clean = [one for one in made if not one.garbled]
-    answered = [one for one in clean if one.replied is not None]
-    waited = [one.replied - one.idle for one in answered if one.replied is not None]
-    total = [one.replied - one.end for one in answered if one.replied is not None]
-    kinds = ", ".join(
-        f"{register:02d}: {sum(one.register == register for one in made)}"
-        for register in (1, 2, 3, 4)
-    )
-    if not waited:
-        return [_count("requests of the boxes", 0, note="there were none")]
+def _readings(
+    prefix: str, scene: MasterScene, times: Sequence[float], seen: Seen
+) -> list[Figure]:
+    due = [time for time, _ in on_plan(times, seen.given.begin)]
+    made = [one for one in readings(seen.log) if one.start >= seen.given.begin]
+    lengths, left_out = rounds(due, made, scene.living)
+    missed = sum(one.end is None for one in made if one.unit in scene.living)
+    periods = [
+        gap
+        for unit in scene.living
+        for gap in gaps(
+            one.start for one in made if one.unit == unit and one.end is not None
+        )
+    ]
     return [
-        _milliseconds("answer to a box's request, p50", percentile(waited, 0.5)),
         _milliseconds(
-            "answer to a box's request, p99",
-            percentile(waited, 0.99),
-            200,
-            note=f"{len(made)} requests ({kinds})",
+            f"{prefix}round, p50",
+            percentile(lengths or [0.0], 0.5),
+            note=f"p99 {percentile(lengths or [0.0], 0.99) * 1000:.0f} ms,"
+            f" max {max(lengths, default=0.0) * 1000:.0f} ms",
         ),
-        _milliseconds("answer to a box's request, max", max(waited), 1000),
-        _milliseconds("request over to answer, max", max(total), 1000),
-        _count(
-            "requests that were not answered in time",
-            len(clean) - len(answered),
-            note=f"beside {len(made) - len(clean)} that collided with our own frames",
+        Figure(
+            NAME,
+            f"{prefix}boxes left out of a round",
+            left_out,
+            digits=0,
+            note=f"of {len(due)} rounds; longest time between two readings of a box"
+            f" {max(periods, default=0.0):.2f} s",
+        ),
+        Figure(
+            NAME,
+            f"{prefix}readings without a reply",
+            missed,
+            digits=0,
+            note=f"of {len(made)}",
         ),
     ]
 
 
-def _safety(
-    prefix: str, offers: Sequence[Offer], shared: Sequence[Shared], end: float
-) -> list[Figure]:
-    found = sums(offers, shared, end)
+def _answers(prefix: str, made: Sequence[SlaveRequest]) -> list[Figure]:
+    """Return the figures of the single requests of 2.17, repetitions included."""
+    clean = [one for one in made if not one.garbled]
+    answered = [one for one in clean if one.replied is not None]
+    waited = [one.replied - one.idle for one in answered if one.replied is not None]
+    if not waited:
+        return []
+    return [
+        _milliseconds(f"{prefix}answer to a request, p50", percentile(waited, 0.5)),
+        _milliseconds(
+            f"{prefix}answer to a request, p99",
+            percentile(waited, 0.99),
+            200,
+            note=f"{len(made)} requests",
+        ),
+        _milliseconds(f"{prefix}answer to a request, max", max(waited), 1000),
+        _count(
+            f"{prefix}requests that were not answered in time",
+            len(clean) - len(answered),
+            note=f"beside {len(made) - len(clean)} that collided with other frames",
+        ),
+    ]
+
+
+def _safety(prefix: str, seen: Seen) -> list[Figure]:
+    found = sums(seen.offers, seen.shared, seen.given.end)
     return [
         _count(
             f"{prefix}sum of the offers risen above the supply",
             found.violations,
-            note=f"highest {found.most:.1f} A; {len(offers)} changes of an offer",
+            note=f"for {found.seconds:.1f} s; highest {found.most:.1f} A;"
+            f" {len(seen.offers)} changes of an offer",
         ),
         _milliseconds(
             f"{prefix}lowered supply to the boxes below it, max", found.longest
@@ -204,12 +257,13 @@ def _safety(
     ]
 
 
-def _given(prefix: str, commands: RandomCommands) -> Figure:
-    errors = "; ".join(sorted(set(commands.refused))[:3])
+def _given(prefix: str, seen: Seen) -> Figure:
+    refused = seen.given.commands.refused
+    errors = "; ".join(sorted(set(refused))[:3])
     return _count(
         f"{prefix}commands that failed",
-        len(commands.refused),
-        note=f"of {commands.given}" + (f": {errors}" if errors else ""),
+        len(refused),
+        note=f"of {seen.given.commands.given}" + (f": {errors}" if errors else ""),
     )
 
 
@@ -217,12 +271,9 @@ def _given(prefix: str, commands: RandomCommands) -> Figure:
 
 
 async def _set_points(times: int) -> list[Figure]:
-    boxes = [
-        {"load_balance": unit, "cable": 32, "max_current": 32, "car": "plugged"}
-        for unit in UNITS
-    ]
-    async with Oracle("smartevse", boxes=boxes) as oracle:
-        bus = master_bus(oracle.url, UNITS, SUPPLY)
+    two = replace(TWO_17, dialects=TWO_17.dialects[:2])
+    async with Oracle("smartevse", boxes=two.boxes(plugged=True)) as oracle:
+        bus = master_bus(oracle.url, two.units, SUPPLY)
         await bus.start()
         try:
             await settled(bus)

@@ -31,9 +31,9 @@ class WatchedAbl(WatchedBox[AblBox]):
 
     # Faults are read every 30 s.
     windows: ClassVar = {"faults": 45.0}
-    # 0.1 A is the floor of the meter, and shown as none.
-    tolerances: ClassVar = {f"1.current.L{n}": 0.11 for n in (1, 2, 3)} | {
-        "1.power": 0.11 * 3 * VOLTAGE
+    # 0.1 A, which the box rounds to, is the floor of the meter, and shown as none.
+    tolerances: ClassVar = {f"1.current.L{n}": 0.151 for n in (1, 2, 3)} | {
+        "1.power": 0.151 * 3 * VOLTAGE
     }
 
     def __init__(self, device: AblBox, charger: Charger) -> None:

@@ -9,11 +9,18 @@ from hypothesis import given, strategies as st
 import pytest
 
 from benchmarks.balancing import (
+    Ask,
+    Reading,
     Shared,
+    SlaveRequest,
+    asked_by_state,
     broadcasts,
     longest_silence,
     on_plan,
+    readings,
+    repeated,
     requests,
+    rounds,
     sums,
 )
 from benchmarks.blocks import watch
@@ -32,6 +39,7 @@ from benchmarks.set_value import _seen
 from custom_components.evse_bus.evse.modbus import AsciiFramer
 from tests.virtual import VirtualBus
 from tests.virtual.ews_frames import INFO, command, frame
+from tests.virtual.smartevse_frames import crc16
 
 MEASURED = Figure(
     benchmark="scan", name="mean", value=271.04, unit="ms", aim=252.0, note="why"
@@ -125,6 +133,11 @@ BROADCAST = "001000010004080064003c00000000ff7a"
 """As recorded."""
 
 
+def frame_of(head: str) -> str:
+    """Return a frame of Modbus from its hex digits without the checksum."""
+    return head + crc16(bytes.fromhex(head)).hex()
+
+
 def _heard(
     start: float, data: str, *, by_us: bool = True, hit: bool = False
 ) -> LoggedFrame:
@@ -144,6 +157,83 @@ def test_broadcasts_are_found_in_the_log() -> None:
     assert broadcasts(log) == [1.0, 6.0]
     assert longest_silence([1.0, 6.0], 7.0) == 5.0
     assert longest_silence([], 7.0) == 0.0
+
+
+@pytest.mark.parametrize("head", ["09100001000810", "09100020000810"])
+def test_broadcasts_to_nodes_are_found(head: str) -> None:
+    assert broadcasts([_heard(1.0, frame_of(head + 16 * "00"))]) == [1.0]
+
+
+def _request(unit: int, register: int, end: float, *, replied: bool) -> SlaveRequest:
+    at = end + 0.1 if replied else None
+    return SlaveRequest(unit, register, end, end, at, garbled=False)
+
+
+def test_repetitions_are_one_wish() -> None:
+    made = [
+        _request(2, 2, 1.0, replied=False),
+        _request(3, 2, 1.5, replied=True),
+        _request(2, 2, 2.1, replied=True),
+        # Another one, which is given up.
+        _request(2, 2, 10.0, replied=False),
+        _request(2, 2, 20.0, replied=True),
+        _request(2, 3, 29.5, replied=False),
+    ]
+    found = sorted(repeated(made, 30.0), key=lambda one: one.since)
+    assert [(one.kind, one.since, round(one.waited, 3)) for one in found] == [
+        ("02", 1.0, 1.2),
+        ("02", 1.5, 0.1),
+        ("02", 10.0, 0.0),
+        ("02", 20.0, 0.1),
+        ("03", 29.5, 0.5),
+    ]
+    assert [one.answered is None for one in found] == [False, False, True, False, True]
+
+
+def _status(unit: int, state: int) -> str:
+    return frame_of(f"{unit:02x}0410{state:04x}" + 14 * "00")
+
+
+READ, GRANT = "020400000008", "0210000000020400050000"
+
+
+def test_a_state_in_which_a_node_waits_is_answered() -> None:
+    log = [
+        _heard(1.0, frame_of(READ)),
+        _heard(1.02, _status(2, 4), by_us=False),
+        _heard(1.05, frame_of(READ)),
+        _heard(1.07, _status(2, 4), by_us=False),
+        _heard(1.5, frame_of(GRANT)),
+        _heard(3.0, frame_of(READ)),
+        _heard(3.02, _status(2, 6), by_us=False),
+        # Garbled, and without a reply.
+        _heard(5.0, frame_of(READ)),
+        _heard(5.02, _status(2, 1), by_us=False, hit=True),
+        _heard(7.0, frame_of(READ)),
+        _heard(7.02, _status(2, 0), by_us=False),
+    ]
+    first, second = asked_by_state(log, 9.0)
+    assert first == Ask(2, "B", pytest.approx(1.03), 1.5, 1.5)
+    assert (second.kind, second.answered) == ("C", None)
+    assert second.waited == pytest.approx(4.0)
+    made = readings(log)
+    assert [one.start for one in made] == [1.0, 1.05, 3.0, 5.0, 7.0]
+    assert [one.end is None for one in made] == [False, False, False, True, False]
+
+
+def test_a_round_ends_when_every_box_was_read() -> None:
+    made = [
+        Reading(2, 0.1, 0.2),
+        Reading(3, 0.3, 0.4),
+        Reading(2, 0.5, 0.6),
+        Reading(2, 2.1, 2.2),
+        Reading(3, 2.3, None),
+        Reading(3, 4.1, 4.2),
+        Reading(2, 4.3, 4.5),
+    ]
+    lengths, left_out = rounds([0.0, 2.0, 4.0, 6.0], made, (2, 3))
+    assert lengths == [pytest.approx(0.4), pytest.approx(0.5)]
+    assert left_out == 1
 
 
 def test_due_broadcasts_are_separated_from_those_between() -> None:
@@ -198,8 +288,10 @@ def test_a_sum_that_rises_above_the_supply_is_a_violation() -> None:
     ]
     found = sums(offers, shared, 10.0)
     assert (found.most, found.violations, found.longest) == (20.0, 0, 0.0)
+    assert found.seconds == 0.0
     found = sums([*offers, _offer(5.0, "b", 6.1)], shared, 10.0)
     assert (found.most, found.violations) == (pytest.approx(20.1), 1)
+    assert found.seconds == pytest.approx(5.0)
     # Not in the same moment: up before the other one is down.
     offers[-1] = _offer(4.1, "b", 6.0)
     assert sums(offers, shared, 10.0).violations == 1
