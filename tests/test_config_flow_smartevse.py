@@ -35,7 +35,7 @@ async def test_each_way_says_what_happens_without_home_assistant(
     await flow.submit({"protocol": "smartevse"})
     assert flow.step == "mode"
     assert flow.tells("LOAD BAL Disabled", "no fail-safe")
-    assert flow.tells("Slave 1", "stop charging after about 10 s")
+    assert flow.tells("Slave 1", "Node 1 to 7", "stop charging after 10 to 18 s")
     await flow.choose("polled")
     assert flow.step == "port"
     flow.abort()
@@ -103,6 +103,7 @@ async def test_box_is_found_in_each_dialect(
         "order_lifetime": 15,
         "fail_safe_current": 6,
         "stop_on_shutdown": True,
+        "dialect": dialect,
     }
 
 

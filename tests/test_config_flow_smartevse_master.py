@@ -52,7 +52,7 @@ async def test_shared_supply_is_asked_before_anything_is_said(
         assert flow.errors == {"supply_minimum": "above_supply"}
         for wrong in (
             {"supply_limit": 5.9},
-            {"supply_limit": 241},
+            {"supply_limit": 561},
             {"supply_limit": "inf"},
             {"supply_minimum": 5.9},
             {"supply_minimum": 16.1},
@@ -77,7 +77,10 @@ async def test_slaves_are_found_and_added(hass: HomeAssistant) -> None:
         assert flow.step == "select"
         assert fields(flow) == {"chargers": ["2", "4"], "installation_limit": 16}
         options = flow.result["data_schema"].schema["chargers"].config["options"]
-        assert [one["label"].split(":")[0] for one in options] == ["Slave 1", "Slave 3"]
+        assert [one["label"].split(":")[0] for one in options] == [
+            "Slave 1 / Node 1",
+            "Slave 3 / Node 3",
+        ]
         await bus.wait_for_async(lambda: not bus.connected)
         # A search only reads: no broadcast either.
         for box in boxes:
@@ -85,9 +88,9 @@ async def test_slaves_are_found_and_added(hass: HomeAssistant) -> None:
             assert not box.broadcasts
 
         await flow.submit({"chargers": ["2", "4"], "installation_limit": 16})
-        assert flow.tells("Charger 1 of 2", "firmware 2.17 at Slave 1")
+        assert flow.tells("Charger 1 of 2", "firmware 2.17 at Slave 1 / Node 1")
         assert fields(flow) == {
-            "name": "SmartEVSE Slave 1",
+            "name": "SmartEVSE Node 1",
             "installation_limit": 16,
             "fail_safe_current": 6,
             "expert": {"poll_interval": 2, "voltage": 230},
@@ -100,7 +103,8 @@ async def test_slaves_are_found_and_added(hass: HomeAssistant) -> None:
         assert flow.step == "confirm_smartevse_master"
         table = flow.result["description_placeholders"]["chargers"]
         assert (
-            table == "| Left | Slave 1 | 16 A | 6 A |\n| Right | Slave 3 | 13 A | 6 A |"
+            table == "| Left | Slave 1 / Node 1 | 16 A | 6 A |\n"
+            "| Right | Slave 3 / Node 3 | 13 A | 6 A |"
         )
         assert flow.tells("25 A per phase", "less than 7 A", "for 10 s")
         await flow.submit()
@@ -123,6 +127,7 @@ async def test_slaves_are_found_and_added(hass: HomeAssistant) -> None:
         "poll_interval": 2,
         "order_lifetime": None,
         "fail_safe_current": 6,
+        "dialect": "2.17",
     }
     assert right.data["address"] == 4
     assert right.data["installation_limit"] == 13
@@ -170,31 +175,69 @@ async def test_box_that_asks_its_meter_and_answers_nobody(hass: HomeAssistant) -
         flow.abort()
 
 
-@pytest.mark.parametrize("dialect", ["2.20", "2.30", "2.30+"])
-async def test_firmware_that_cannot_be_a_slave_is_told(
-    hass: HomeAssistant, dialect: str
+async def test_nodes_of_later_firmware_are_found_at_all_addresses(
+    hass: HomeAssistant,
 ) -> None:
-    with VirtualBus.in_loop(SmartEvse(dialect, load_balance=3)) as bus:
+    boxes = slave(2, dialect="2.30"), slave(5, dialect="2.30+"), slave(8, dialect="3")
+    with VirtualBus.in_loop(*boxes) as bus:
         flow = await searched(hass, bus)
-        assert flow.step == "unsupported"
-        assert flow.result["menu_options"] == ["scan", "manual", "port"]
-        told = flow.result["description_placeholders"]["chargers"]
-        assert told.startswith("- Slave 2: ")
-        assert f"firmware {dialect[:4]}" in told
-        assert flow.tells("firmware 2.17", "LOAD BAL to Disabled")
-        # It is not added by hand without a word, either: what it is was told.
+        assert flow.progress == sorted(flow.progress)
+        assert flow.step == "select"
+        assert fields(flow)["chargers"] == ["2", "5", "8"]
+        await flow.submit({"chargers": ["2", "5", "8"], "installation_limit": 16})
+        assert fields(flow)["name"] == "SmartEVSE Node 1"
+        for name in ("A", "B", "C"):
+            await flow.submit(charger(name))
+        assert flow.step == "confirm_smartevse_master"
+        await flow.submit()
+        for box in boxes:
+            assert not box.writes
+            assert not box.broadcasts
+    kept = [one.data["dialect"] for one in flow.result["result"].subentries.values()]
+    assert kept == ["2.30", "2.30+", "3.x"]
+
+
+async def test_box_that_perhaps_does_not_stop_is_told(hass: HomeAssistant) -> None:
+    boxes = slave(2, dialect="3.6"), slave(3, dialect="3")
+    with VirtualBus.in_loop(*boxes) as bus:
+        flow = await searched(hass, bus)
+        await flow.submit({"chargers": ["2", "3"], "installation_limit": 16})
+        await flow.submit(charger("Old one"))
+        await flow.submit(charger("New one"))
+        assert flow.step == "fail_safe_unproven"
+        assert flow.tells("**Old one**", "before 3.7.4", "Update")
+        await flow.submit()
+        assert flow.step == "confirm_smartevse_master"
         flow.abort()
 
 
-async def test_the_others_can_be_added_beside_one_that_cannot(
-    hass: HomeAssistant,
+@pytest.mark.parametrize(
+    ("dialects", "shown"),
+    [
+        (("2.17", "2.30"), "firmware 2.17\n\n- Slave 2 / Node 2: SmartEVSE v2"),
+        (("2.17", "2.20"), "firmware 2.17\n\n- Slave 2 / Node 2: SmartEVSE v2"),
+        (("2.30+", "2.20"), "firmware 2.20\n\n- Slave 1 / Node 1: SmartEVSE v2"),
+        (("3", "2.20"), "firmware 2.20\n\n- Slave 1 / Node 1: SmartEVSE v3"),
+    ],
+)
+async def test_mix_of_firmwares_is_refused(
+    hass: HomeAssistant, dialects: tuple[str, str], shown: str
 ) -> None:
-    with VirtualBus.in_loop(slave(2), SmartEvse("2.30+", load_balance=3)) as bus:
+    first, second = (
+        slave(unit, dialect=dialect) for unit, dialect in enumerate(dialects, start=2)
+    )
+    with VirtualBus.in_loop(first, second) as bus:
         flow = await searched(hass, bus)
-        assert flow.step == "unsupported"
-        assert flow.result["menu_options"] == ["select", "scan", "manual", "port"]
-        await flow.choose("select")
-        assert fields(flow)["chargers"] == ["2"]
+        assert flow.step == "mixed_firmware"
+        assert flow.result["menu_options"] == ["scan", "port"]
+        assert shown in flow.result["description_placeholders"]["chargers"]
+        assert flow.tells("off this line", "Update", "Another setting under LOAD BAL")
+        # As the text says.
+        bus.remove(second)
+        await flow.choose("scan")
+        await flow.wait()
+        assert flow.step == "select"
+        assert not first.writes
         flow.abort()
 
 
@@ -203,7 +246,7 @@ async def test_two_boxes_with_one_unit_are_told(hass: HomeAssistant) -> None:
     with VirtualBus.in_loop(*twins, slave(3)) as bus:
         flow = await searched(hass, bus)
         assert flow.step == "duplicates"
-        assert flow.tells("at Slave 1 on", "a number of its own")
+        assert flow.tells("at Slave 1 / Node 1 on", "a number of its own")
         await flow.choose("select")
         assert fields(flow)["chargers"] == ["3"]
         flow.abort()
@@ -215,7 +258,7 @@ async def test_slaves_are_typed_in(hass: HomeAssistant) -> None:
         assert flow.step == "nothing_found"
         await flow.choose("manual")
         [slaves] = flow.result["data_schema"].schema.values()
-        assert slaves.config["options"] == ["2", "3", "4"]
+        assert slaves.config["options"] == [str(unit) for unit in range(2, 9)]
         with pytest.raises(InvalidData):
             await flow.submit({"slaves": ["1"]})
         await flow.submit({"slaves": []})

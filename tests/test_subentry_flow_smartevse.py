@@ -14,6 +14,7 @@ from tests.common import (
     get_entity,
     setup_bus,
     wait_for_state,
+    wait_until,
 )
 from tests.flow import NOWHERE, Flow, charger, fields
 from tests.virtual import SmartEvse, VirtualBus
@@ -127,16 +128,51 @@ async def test_slave_that_is_there_already_is_refused(hass: HomeAssistant) -> No
         await take_down(hass, entry)
 
 
-async def test_slave_with_another_firmware_is_told(hass: HomeAssistant) -> None:
+async def test_slave_with_another_firmware_is_refused(hass: HomeAssistant) -> None:
     with VirtualBus.in_loop(slave(2), SmartEvse("2.30+", load_balance=3)) as bus:
         entry = await master_bus(hass, bus.url, 2)
+        [first] = entry.subentries.values()
+        await wait_until(hass, lambda: first.data.get("dialect"))
         flow = await Flow.add_charger(hass, entry)
         await flow.choose("scan")
         await flow.wait()
-        assert flow.step == "unsupported"
-        assert flow.result["menu_options"] == ["scan", "manual"]
-        assert flow.tells("firmware 2.30")
+        assert flow.step == "mixed_firmware"
+        assert flow.result["menu_options"] == ["scan"]
+        shown = flow.result["description_placeholders"]["chargers"]
+        assert (
+            f"- {first.title} (Slave 1 / Node 1): SmartEVSE v2, firmware 2.17" in shown
+        )
+        assert "- Slave 2 / Node 2: SmartEVSE v2, firmware 2.30" in shown
         flow.abort()
+        await take_down(hass, entry)
+
+
+async def test_mix_that_comes_about_meanwhile_is_refused(hass: HomeAssistant) -> None:
+    """Two flows at once, and a changed configuration of a box that is not there."""
+    with VirtualBus.in_loop() as bus:
+        entry = await master_bus(hass, bus.url, 2, 3)
+        one, other = entry.subentries.values()
+        for subentry, dialect in ((one, "2.20"), (other, "2.30")):
+            hass.config_entries.async_update_subentry(
+                entry, subentry, data={**subentry.data, "dialect": dialect}
+            )
+        flow = await Flow.change_settings(hass, entry, one)
+        typed = {
+            key: value
+            for key, value in charger("New").items()
+            if key != "fail_safe_current"
+        }
+        await flow.submit({**typed, "slave": "2"})
+        assert flow.errors == {"base": "mixed_firmware"}
+        assert flow.tells("firmware 2.20", "firmware 2.30")
+        assert one.title != "New"
+        flow = await Flow.add_charger(hass, entry)
+        await flow.choose("manual")
+        await flow.submit({"slave": "4"})
+        await flow.submit(charger("Four"))
+        await flow.submit()
+        assert flow.result["reason"] == "mixed_firmware"
+        assert len(entry.subentries) == 2
         await take_down(hass, entry)
 
 

@@ -350,6 +350,8 @@ class EvseBusConfigFlow(ListenerSteps, domain=DOMAIN):
                 return self.async_abort(reason="already_configured")
         if (held := self.find_held()) is not None:
             return self.abort_held(held)
+        if (refused := self.abort_mix()) is not None:
+            return refused
         return self.async_create_entry(
             title=_title(self.bus_data), data=self.bus_data, subentries=chargers
         )

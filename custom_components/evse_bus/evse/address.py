@@ -51,6 +51,10 @@ class AddressForm(ABC):
         """Return an address as people set it on the charger."""
         return self.show(address)
 
+    def title(self, address: Address) -> str:
+        """Return the part of a charger's name that stands for its address."""
+        return self.label(address)
+
     def serial(self, address: Address) -> str | None:
         """Return the serial number that an address stands for, if it is one."""
         if not self.is_serial or address == self.any:
@@ -68,8 +72,8 @@ class NumberAddress(AddressForm):
     """Digits it is shown with, zeros in front."""
     labelled: bool = False
     """Each number has a text of its own, under the key of the form."""
-    menu: Mapping[int, str] = field(default_factory=dict)
-    """Settings in the menu of the charger that stand for numbers."""
+    menu: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
+    """Settings in the menu of the charger that stand for numbers: in its firmwares."""
 
     @override
     def parse(self, text: object) -> int:
@@ -86,7 +90,11 @@ class NumberAddress(AddressForm):
 
     @override
     def label(self, address: Address) -> str:
-        return self.menu.get(int(address)) or self.show(address)
+        return " / ".join(self.menu.get(int(address), ())) or self.show(address)
+
+    @override
+    def title(self, address: Address) -> str:
+        return (self.menu.get(int(address)) or (self.show(address),))[-1]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

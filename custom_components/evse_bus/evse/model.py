@@ -192,6 +192,8 @@ class FailSafe(StrEnum):
     FALLS_BACK = "falls_back"
     """It charges with its fail-safe current after its time-out."""
     STOPS = "stops"
+    UNPROVEN = "unproven"
+    """It stops, or the last limit stays in effect: which one cannot be read."""
     ENDS = "ends"
     """It ends the charge after 10 min, and unlocks the plug (EWS-Box)."""
 

@@ -5,7 +5,7 @@ interface asks for its chargers: names, addresses, options. A protocol's folder 
 such description for each way in which its chargers are used.
 """
 
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,6 +20,7 @@ from .master import BusMaster, ChargerGroup
 from .memory import LineMemory
 from .model import ChargerConfig, Circuit, Orders
 from .options import Option
+from .readings import ChargerInfo
 from .redaction import SerialNumbers
 from .scan import ScanResult
 
@@ -51,6 +52,16 @@ class CircuitRange:
     """Highest limit of all chargers together, A per phase."""
     highest_minimum: float
     """Highest minimum for each charger that charges, A."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Kinds:
+    """Kinds of boxes that cannot have one bus together."""
+
+    kind: Callable[[Mapping[str, str]], str | None]
+    """Return the kind of a box, from its facts; ``None``: not known."""
+    info: Callable[[Mapping[str, str]], ChargerInfo]
+    """Return what is shown of a box whose kind is known."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -114,6 +125,9 @@ class Protocol[C: ChargerConfig = Any]:
     lifetime_is_fail_safe: bool = False
     """Nothing in a charger ends a charge when no message comes: the order lifetime is
     asked for among the first fields, not folded away."""
+
+    kinds: Kinds | None = None
+    """Kinds of boxes of which a bus may have one only; ``None``: there are none."""
 
     # -- Identity and privacy --------------------------------------------------------
 

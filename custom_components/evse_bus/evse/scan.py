@@ -1,7 +1,9 @@
 """The result of a scan of a bus."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
+from .model import FailSafe
 from .readings import ChargerInfo
 from .round_trip import RoundTrip
 
@@ -21,6 +23,10 @@ class FoundCharger:
     connectors: int = 1
     maximum_currents: tuple[float | None, ...] = ()
     """Of each port, where a box has ports of its own, A."""
+    facts: Mapping[str, str] = field(default_factory=dict)
+    """What was read of it beside its serial number and is kept, as `Charger.facts`."""
+    fail_safe: FailSafe | None = None
+    """What it does when no message comes; ``None``: that of its protocol."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,8 +38,6 @@ class ScanResult:
     """Addresses at which more than one charger answers."""
     unreadable: bool = False
     """Bytes came, but no good frame: wrong protocol or parity."""
-    unsupported: tuple[FoundCharger, ...] = ()
-    """Chargers with a firmware that cannot be used in this way."""
     other_master: bool = False
     """Another master is active on this line; nothing was sent."""
     foreign_requests: bool = False

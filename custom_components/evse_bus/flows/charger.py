@@ -111,7 +111,7 @@ def default_name(protocol: Protocol, address: Address) -> str:
     form = protocol.address
     if form.single:
         return protocol.make.name
-    label = form.label(address)
+    label = form.title(address)
     if form.is_serial:
         label = label[-_NAME_DIGITS:]
     return f"{protocol.make.name} {label}"

@@ -183,7 +183,6 @@ async def _async_search_once(
         found=tuple(one for result in results for one in result.found),
         duplicates=tuple(one for result in results for one in result.duplicates),
         unreadable=any(result.unreadable for result in results),
-        unsupported=tuple(one for result in results for one in result.unsupported),
         other_master=any(result.other_master for result in results),
         gateway=bus.wire.gateway.detected,
         round_trip=bus.wire.round_trip,

@@ -12,6 +12,7 @@ from homeassistant.data_entry_flow import FlowContext, FlowResult
 from ..configuration import line_settings
 from ..connections import connection_name, line_memory
 from ..const import CONF_INSTALLATION_LIMIT, SUBENTRY_CHARGER
+from ..evse.model import FailSafe
 from ..evse.scan import Address, ScanResult
 from ..identity import Holder, holder, identity_data
 from ..issues import load_texts, speed_texts
@@ -26,6 +27,7 @@ from .charger import (
     confirm_row,
     default_name,
 )
+from .kinds import Member, find_mix
 from .progress import async_show_long_enough
 from .schema import (
     CONF_CHARGERS,
@@ -33,7 +35,6 @@ from .schema import (
     check_currents,
     found_form,
     found_options,
-    model_name,
 )
 from .search import error_key, overload_of
 from .supply import supply_texts
@@ -71,6 +72,8 @@ class ChargerSteps[
         self._result = ScanResult()
         self._error: str | None = None
         self._pending: list[Candidate] = []
+        self._unproven: list[str] = []
+        """Names of new chargers that may not stop by themselves."""
         self.held_by = NO
         """Where a box is set up already that was typed in, for texts."""
 
@@ -145,8 +148,8 @@ class ChargerSteps[
         steps = {
             "other_master": result.other_master,
             "modbus_tcp": result.gateway,
+            "mixed_firmware": self._mix_found(),
             "duplicates": result.duplicates,
-            "unsupported": result.unsupported,
             "select": self._new(),
             "nothing_new": result.found,
             "replies_too_late": trip is not None and trip.too_slow,
@@ -233,18 +236,40 @@ class ChargerSteps[
         found = {one.address for one in self._result.found}
         return self.taken() | found | set(self._result.duplicates)
 
-    async def async_step_unsupported(
+    def _mix_found(self) -> str | None:
+        """Return the boxes on the line, where one bus cannot have them all."""
+        return find_mix(
+            self.protocol,
+            [
+                *map(Member.of_stored, self.others()),
+                *map(Member.of_found, self._result.found),
+            ],
+        )
+
+    async def async_step_mixed_firmware(
         self,
         user_input: dict[str, Any] | None = None,  # noqa: ARG002
     ) -> ResultT:
-        """Report chargers whose firmware this protocol does not support."""
-        label = self.protocol.address.label
-        chargers = "\n".join(
-            f"- {label(one.address)}: {model_name(one)}"
-            for one in self._result.unsupported
+        """Refuse boxes that one bus cannot have together: some have to leave it."""
+        return self.async_show_menu(
+            step_id="mixed_firmware",
+            menu_options=[one for one in self.choices() if one != "manual"],
+            description_placeholders=self.placeholders()
+            | {"chargers": self._mix_found() or NO},
         )
-        first = ("select",) if self._new() else ()
-        return self._menu("unsupported", first, chargers=chargers)
+
+    def abort_mix(self) -> ResultT | None:
+        """Abort where one bus cannot have all its boxes, perhaps since just now.
+
+        ``None``: it can, as far as is known.
+        """
+        running = map(Member.of_stored, self.others())
+        mix = find_mix(self.protocol, [*running, *map(Member.of_stored, self.ready)])
+        if mix is None:
+            return None
+        return self.async_abort(
+            reason="mixed_firmware", description_placeholders={"chargers": mix}
+        )
 
     async def async_step_other_master(
         self,
@@ -339,6 +364,7 @@ class ChargerSteps[
         """Begin with the form for the first charger."""
         self._pending = list(candidates)
         self.ready = []
+        self._unproven = []
         return await self.async_step_charger()
 
     async def async_step_charger(
@@ -352,7 +378,7 @@ class ChargerSteps[
                 self._pending.pop(0)
                 user_input = None
                 if not self._pending:
-                    return await self.async_step_line_too_slow()
+                    return await self.async_step_fail_safe_unproven()
         candidate = self._pending[0]
         if (other := self.holder(candidate.serial(self.protocol))) is not None:
             return self.abort_held(other)
@@ -433,6 +459,10 @@ class ChargerSteps[
             errors["base"] = "box_already_set_up"
         if not errors:
             data = charger_data(self.protocol, candidate.address, serial, typed)
+            if (found := candidate.found) is not None:
+                data |= found.facts
+                if found.fail_safe is FailSafe.UNPROVEN:
+                    self._unproven.append(typed[CONF_NAME].strip())
             self.ready.append(
                 ConfigSubentryData(
                     data=data | identity_data(self.protocol, serial),
@@ -442,6 +472,21 @@ class ChargerSteps[
                 )
             )
         return errors
+
+    # -- Fail-safe ---------------------------------------------------------------
+
+    async def async_step_fail_safe_unproven(
+        self, user_input: dict[str, Any] | None = None
+    ) -> ResultT:
+        """Warn of boxes of which it is not known that they stop by themselves."""
+        if user_input is not None or not self._unproven:
+            return await self.async_step_line_too_slow()
+        return self.async_show_form(
+            step_id="fail_safe_unproven",
+            description_placeholders=self.placeholders()
+            | {"chargers": ", ".join(self._unproven)},
+            last_step=False,
+        )
 
     # -- Speed of the line -------------------------------------------------------
 

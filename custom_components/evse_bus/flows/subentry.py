@@ -28,11 +28,13 @@ from ..evse.scan import Address, ScanResult
 from ..identity import another_box, another_box_texts, kept_data
 from .address import Errors, another_form, typed_addresses
 from .charger import (
+    NO,
     charger_data,
     charger_form,
     charger_suggestions,
     check_charger,
 )
+from .kinds import Member, find_mix
 from .listener import found_box
 from .search import async_search, read_only_probe
 from .steps import ChargerSteps
@@ -142,6 +144,8 @@ class ChargerSubentryFlow(
             return self.async_abort(reason="already_configured")
         if (other := self.find_held()) is not None:
             return self.abort_held(other)
+        if (refused := self.abort_mix()) is not None:
+            return refused
         return self.async_create_entry(
             title=charger["title"],
             data=charger["data"],
@@ -167,24 +171,30 @@ class ChargerSubentryFlow(
         stored = subentry.data
         known: str | None = stored.get(CONF_SERIAL)
         errors: Errors = {}
+        mix: str | None = None
         if user_input is not None:
             asked = known is None or not self.protocol.address.is_serial
             address, errors = self._address(subentry, user_input, asked=asked)
-            others = [one.data for one in self.others()]
-            errors |= check_charger(self.protocol, user_input, others)
+            beside = [one.data for one in self.others()]
+            errors |= check_charger(self.protocol, user_input, beside)
             serial = known or self._typed_serial(address, user_input)
             if not errors and known is None and self.find_holder([serial], subentry):
                 errors["base"] = "box_already_set_up"
             if not errors:
+                title = user_input[CONF_NAME].strip()
                 data = charger_data(self.protocol, address, serial, user_input)
-                return self.async_update_and_abort(
-                    entry,
-                    subentry,
-                    title=user_input[CONF_NAME].strip(),
-                    data=data
-                    | kept_data(self.protocol, subentry)
-                    | _fail_safe(stored, data),
-                )
+                data |= kept_data(self.protocol, subentry)
+                own = Member(address, data, title)
+                others = map(Member.of_stored, self.others())
+                mix = find_mix(self.protocol, [*others, own])
+                if mix is None:
+                    return self.async_update_and_abort(
+                        entry,
+                        subentry,
+                        title=title,
+                        data=data | _fail_safe(stored, data),
+                    )
+                errors["base"] = "mixed_firmware"
         form = charger_form(
             self.protocol, ask_address=True, ask_serial=known is None, new=False
         )
@@ -194,7 +204,11 @@ class ChargerSubentryFlow(
                 form, user_input or charger_suggestions(self.protocol, subentry)
             ),
             errors=errors,
-            description_placeholders={"name": subentry.title, "holder": self.held_by},
+            description_placeholders={
+                "name": subentry.title,
+                "holder": self.held_by,
+                "chargers": mix or NO,
+            },
         )
 
     async def async_step_reconfigure_box(

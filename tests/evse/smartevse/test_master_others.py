@@ -10,6 +10,7 @@ from custom_components.evse_bus.evse.model import Circuit, Fault, OrderChange
 from custom_components.evse_bus.evse.scan import ScanResult
 from custom_components.evse_bus.evse.smartevse import MASTER
 from custom_components.evse_bus.evse.smartevse.master import STAY_SILENT, Master
+from tests.evse.simulated_line import until
 from tests.evse.smartevse.frames import OTHER_BROADCAST, frame
 from tests.evse.smartevse.scene import MasterScene
 from tests.simulated_time import now, simulate
@@ -151,19 +152,52 @@ def test_another_dialect_is_not_written_to(dialect: str) -> None:
     simulate(scene())
 
 
-def test_a_scan_only_reads_and_reports_unsupported_boxes() -> None:
+def test_a_scan_only_reads_and_reports_all_dialects() -> None:
     async def scene() -> None:
         async with MasterScene(units=()) as scene:
             scene.plug_box(2)
             scene.plug_box(4, "2.30+")
             begin = now()
             report = await scan(scene.bus, scene)
-            assert [one.address for one in report.found] == [2]
-            assert report.found[0].info.firmware == "2.17"
-            assert [one.address for one in report.unsupported] == [4]
+            assert [one.address for one in report.found] == [2, 4]
+            assert [one.facts["dialect"] for one in report.found] == ["2.17", "2.30+"]
             assert not report.other_master
             assert {sent.data[1] for sent in scene.line.sent} <= {3, 4}
             assert scene.line.sent[0].when - begin >= 2.5
+
+    simulate(scene())
+
+
+@pytest.mark.parametrize("noisy", [1, 3])
+def test_a_scan_tells_noise_from_two_boxes(noisy: int) -> None:
+    """Two boxes disturb each other in every round, noise in one of them."""
+
+    async def scene() -> None:
+        async with MasterScene(units=()) as scene:
+            scene.plug_box(2)
+            looking = asyncio.create_task(scan(scene.bus, scene))
+            for count in range(1, noisy + 1):
+                await until(
+                    lambda: [one.data[0] for one in scene.line.sent].count(3) == count  # noqa: B023
+                )
+                scene.line.send(b"\x03\x04\x12\x00\x55\xaa")
+            report = await looking
+            assert [one.address for one in report.found] == [2]
+            assert report.duplicates == ((3,) if noisy == 3 else ())
+
+    simulate(scene())
+
+
+def test_a_scan_of_an_empty_line_is_short() -> None:
+    async def scene() -> None:
+        async with MasterScene(units=()) as scene:
+            begin = now()
+            report = await scan(scene.bus, scene)
+            assert report == ScanResult()
+            # Of which 2.5 s to listen for another master.
+            assert now() - begin < 8
+            asked = [one.data[0] for one in scene.line.sent]
+            assert asked == [*range(2, 9), *range(2, 9), 2, 3, 4]
 
     simulate(scene())
 

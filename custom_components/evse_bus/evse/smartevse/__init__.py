@@ -1,5 +1,6 @@
 """SmartEVSE v2: Modbus RTU on RS-485, polled or with us as load-balancing master."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 import re
 from typing import Final
@@ -9,12 +10,15 @@ from ..framing import LineSettings
 from ..modbus import RtuFramer
 from ..model import MAXIMUM_CURRENT
 from ..options import Toggle
-from ..protocol import CircuitRange, Make, Protocol
+from ..protocol import CircuitRange, Kinds, Make, Protocol
+from ..readings import ChargerInfo
 from ..redaction import SerialNumbers
-from .config import PolledConfig, SlaveConfig
+from .config import PolledConfig, SlaveConfig, kept_dialect
+from .dialects import MAPS, Dialect
 from .master import Master
 from .polled import PolledSmartEvse
 from .reader import TIMING
+from .readings import charger_info
 from .scan import scan_polled, scan_slaves
 from .slave import SlaveSmartEvse
 
@@ -38,6 +42,17 @@ _SERIALS: Final = SerialNumbers(
     in_frame=re.compile(rb"(?s)(?<=\A.\x04\x18.{22}).{1,4}"),
     distinct=False,
 )
+
+
+def _family(facts: Mapping[str, str]) -> str | None:
+    """Return the family of a box: one broadcast is for one of them."""
+    dialect = kept_dialect(facts.get("dialect", ""))
+    return None if dialect is None else MAPS[dialect].balancing.family
+
+
+def _info(facts: Mapping[str, str]) -> ChargerInfo:
+    return charger_info(Dialect(facts["dialect"]), facts.get("serial"))
+
 
 POLLED: Final = Protocol(
     key="smartevse",
@@ -75,14 +90,23 @@ MASTER: Final = Protocol(
     address=NumberAddress(
         key="slave",
         lowest=2,
-        highest=4,
+        highest=8,
         labelled=True,
-        # Setting LOAD BAL.
-        menu={2: "Slave 1", 3: "Slave 2", 4: "Slave 3"},
+        # Setting LOAD BAL; 2.17 has no more than three slaves.
+        menu={
+            2: ("Slave 1", "Node 1"),
+            3: ("Slave 2", "Node 2"),
+            4: ("Slave 3", "Node 3"),
+            5: ("Node 4",),
+            6: ("Node 5",),
+            7: ("Node 6",),
+            8: ("Node 7",),
+        },
         has_serial=False,
     ),
-    # Three boxes at most; the minimum as in the menu of a box (MIN).
-    circuit=CircuitRange(highest=3 * MAXIMUM_CURRENT, highest_minimum=16),
+    # Seven boxes at most; the minimum as in the menu of a box (MIN).
+    circuit=CircuitRange(highest=7 * MAXIMUM_CURRENT, highest_minimum=16),
+    kinds=Kinds(kind=_family, info=_info),
     serials=_SERIALS,
     serial_identifies=False,
 )

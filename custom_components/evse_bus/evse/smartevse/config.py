@@ -2,14 +2,15 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Final
 
 from ..model import ChargerConfig, Fact
-from .balancing import SLAVES
 from .dialects import UNITS, Dialect
 
+SLAVES: Final = UNITS[2:]
 
-def _dialect(text: str) -> Dialect | None:
+
+def kept_dialect(text: str) -> Dialect | None:
     """Return a kept dialect; ``None``: a later version knew more of them."""
     return Dialect(text) if text in Dialect else None
 
@@ -23,7 +24,7 @@ class SmartEvseConfig(ChargerConfig):
 
     facts: ClassVar[Mapping[str, Fact]] = {
         **ChargerConfig.facts,
-        "dialect": Fact(_dialect),
+        "dialect": Fact(kept_dialect),
     }
 
     poll_interval: float = 2.0
@@ -57,10 +58,10 @@ class PolledConfig(SmartEvseConfig):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SlaveConfig(SmartEvseConfig):
-    """A SmartEVSE whose load balancing is set to slave 1, 2 or 3: unit 2, 3 or 4."""
+    """A SmartEVSE whose load balancing is set to slave (node) 1 to 7: unit 2 to 8."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for an address that no slave has."""
         if self.address not in SLAVES:
-            message = f"{self.address} is no address of a slave (2 to 4)"
+            message = f"{self.address} is no address of a slave (2 to 8)"
             raise ValueError(message)

@@ -5,6 +5,7 @@ protocols need to search are not used here.
 """
 
 import asyncio
+from dataclasses import replace
 from functools import partial
 from typing import Final
 
@@ -19,12 +20,12 @@ from ..errors import (
     ReplyTimeoutError,
 )
 from ..exchange import Turn
-from ..model import ChargerConfig, Fault, Orders, Setting
+from ..model import ChargerConfig, FailSafe, Fault, Orders, Setting
 from ..protocol import Progress
 from ..registers import Block
 from ..scan import FoundCharger, ScanResult
-from .balancing import SLAVES
-from .dialects import MAPS, Dialect, Status
+from .config import SLAVES
+from .dialects import MAPS, PROBE_A0, Dialect, Status
 from .memory import SmartEvseMemory
 from .polled import QUIET
 from .probing import Read, find_dialect
@@ -47,8 +48,10 @@ ATTEMPTS: Final = 2
 ATTEMPTS_ON_BAD_LINE: Final = 4
 """Requests on a line that is busy, or where a reply was garbled."""
 SLAVE_ATTEMPTS: Final = 3
-"""Requests to a slave: right after power-up, or during a request of its own, it may
-miss one."""
+"""Requests to a slave that has replied before: it may miss one."""
+ROUNDS: Final = (SLAVES, SLAVES, MAPS[Dialect.V2_17].balancing.units)
+"""The units asked in each round of a search, less those found. Right after power-up a
+box may miss a request, one of 2.17 also during a request of its own."""
 
 
 async def scan_polled(
@@ -91,37 +94,44 @@ async def scan_slaves(
     port is lost meanwhile.
     """
     del config, orders
-    found: list[FoundCharger] = []
-    unsupported: list[FoundCharger] = []
-    garbled: list[int] = []
+    found: dict[int, FoundCharger] = {}
+    garbled: set[int] = set()
+    strangers: set[int] = set()
     progress(0.0)
-    for index, unit in enumerate(SLAVES):
+    plan = [unit for units in ROUNDS for unit in units]
+    for index, unit in enumerate(plan):
+        if unit in found or unit in strangers:
+            continue
+        garbled.discard(unit)
         try:
-            charger, dialect = await _identify(
-                unit, partial(_read_patiently, bus, unit)
-            )
+            found[unit] = await _identify_slave(bus, unit)
         except GarbledReplyError:
-            garbled.append(unit)
+            # In each round: two boxes. In one, it was noise.
+            garbled.add(unit)
         except ReplyTimeoutError, LineBusyError:
             pass
         except ImplausibleReplyError, ExchangeRefusedError:
             # Another Modbus device has this address.
-            pass
+            strangers.add(unit)
         except NotAvailableError:
             if not _has_other_master(bus):
                 raise
             return ScanResult(other_master=True)
-        else:
-            (found if dialect is Dialect.V2_17 else unsupported).append(charger)
-        progress((index + 1) / len(SLAVES))
-    if not found and not unsupported and len(garbled) == len(SLAVES):
-        # Boxes do not collide at all three: the line settings do not fit.
+        progress((index + 1) / len(plan))
+    progress(1.0)
+    if len(garbled) == len(SLAVES):
+        # Boxes do not collide at all addresses: the line settings do not fit.
         return ScanResult(unreadable=True)
     return ScanResult(
-        found=tuple(found),
-        unsupported=tuple(unsupported),
-        duplicates=tuple(garbled),
+        found=tuple(found[unit] for unit in sorted(found)),
+        duplicates=tuple(sorted(garbled)),
     )
+
+
+async def _identify_slave(bus: Bus, unit: int) -> FoundCharger:
+    charger, dialect = await _identify(unit, partial(_read_slave, bus, unit))
+    proven = MAPS[dialect].balancing.fail_safe_proven
+    return replace(charger, fail_safe=FailSafe.STOPS if proven else FailSafe.UNPROVEN)
 
 
 def _has_other_master(bus: Bus) -> bool:
@@ -168,6 +178,7 @@ async def _identify(unit: int, read: Read) -> tuple[FoundCharger, Dialect]:
         info=info,
         serial=info.serial,
         maximum_current=await _maximum(dialect, status, read),
+        facts={"dialect": dialect.value},
     )
     return charger, dialect
 
@@ -183,9 +194,13 @@ async def _maximum(dialect: Dialect, status: Status, read: Read) -> float | None
     return float(min(configured, status.maximum or configured))
 
 
-async def _read_patiently(bus: Bus, unit: int, block: Block) -> bytes:
-    """Return a block, each request in a turn of its own."""
-    for last in (False,) * (SLAVE_ATTEMPTS - 1) + (True,):
+async def _read_slave(bus: Bus, unit: int, block: Block) -> bytes:
+    """Return a block, each request in a turn of its own.
+
+    Nothing may have this address, so the first block is asked for once.
+    """
+    attempts = 1 if block == PROBE_A0 else SLAVE_ATTEMPTS
+    for last in (False,) * (attempts - 1) + (True,):
         try:
             return await bus.run(lambda turn: _read(unit, turn, block))
         except ReplyTimeoutError, LineBusyError:
