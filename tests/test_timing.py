@@ -35,7 +35,11 @@ TIMED = (
     "ews/timing.py",
     "line.py",
     "recovery.py",
+    "smartevse/dialects.py",
+    "smartevse/handshake_polled.py",
+    "smartevse/handshake_requests.py",
     "smartevse/master.py",
+    "smartevse/other_masters.py",
     "smartevse/polled.py",
     "smartevse/reader.py",
     "smartevse/slave.py",
@@ -48,6 +52,7 @@ OTHERS = {
     "abl.reader.E0_OURS",
     "bus.FAILURES_WINDOW",
     "ews.network.listener.CROWD_LOGGED",
+    "smartevse.dialects.Map.search_time",
 }
 """Constants of these files that are no times of a line."""
 

@@ -77,6 +77,8 @@ class Fault(StrEnum):
     # Found by this library.
     UNSUPPORTED_FIRMWARE = "unsupported_firmware"
     SECOND_MASTER = "second_master"
+    MIXED_DIALECTS = "mixed_dialects"
+    """The boxes of one bus need different broadcasts: nothing is written."""
     CHARGES_ALTHOUGH_PAUSED = "charges_although_paused"
     LIMIT_EXCEEDED = "limit_exceeded"
     LIMIT_NOT_TAKEN = "limit_not_taken"

@@ -25,7 +25,7 @@ from tests.virtual.smartevse_registers import DIALECTS
 
 SETTINGS = LineSettings(baudrate=9600)
 BYTE = SETTINGS.byte_time
-BROADCAST = bytes((0, 0x10, 0, 1))
+BROADCASTS = (bytes((0, 0x10, 0, 1)), bytes((9, 0x10, 0, 1)), bytes((9, 0x10, 0, 0x20)))
 
 
 @dataclass
@@ -67,7 +67,7 @@ class Sent:
 
     @property
     def is_broadcast(self) -> bool:
-        return self.data.startswith(BROADCAST)
+        return self.data.startswith(BROADCASTS)
 
     @property
     def values(self) -> tuple[int, ...]:
@@ -154,6 +154,7 @@ class MasterScene(LiveScene):
     allowed: bool | None = True
     maximum: int = 16
     watch: bool = True
+    dialect: str = "2.17"
     line: SmartEvseLine = field(init=False)
     bus: Bus = field(init=False)
     master: Master = field(init=False)
@@ -184,11 +185,11 @@ class MasterScene(LiveScene):
             self.line, RtuFramer(), MASTER.timing, "simulated", group=self.master
         )
 
-    def plug_box(self, unit: int, dialect: str = "2.17") -> Box:
+    def plug_box(self, unit: int, dialect: str | None = None) -> Box:
         car = Car(max_current=32.0)
         settings = {"load_balance": unit, "max_current": self.maximum}
         controller = SmartEvseController(
-            DIALECTS[dialect],  # type: ignore[index]
+            DIALECTS[dialect or self.dialect],
             car,
             cable=32,
             settings=settings,

@@ -8,6 +8,7 @@ import pytest
 
 from custom_components.evse_bus.evse.errors import EvseError, LineLostError
 from custom_components.evse_bus.evse.model import Circuit, OrderChange, Setting
+from custom_components.evse_bus.evse.smartevse.dialects import STOPS_ALONE
 from custom_components.evse_bus.evse.smartevse.master import (
     LISTENING,
     PERIOD,
@@ -15,7 +16,6 @@ from custom_components.evse_bus.evse.smartevse.master import (
     SLACK,
 )
 from custom_components.evse_bus.evse.smartevse.reader import TIMING
-from custom_components.evse_bus.evse.smartevse.sharing import STOPS_ALONE
 from tests.evse.smartevse.scene import Box, MasterScene, Sent
 from tests.simulated_time import now, simulate
 

@@ -13,7 +13,8 @@ from custom_components.evse_bus.evse.model import (
     OrderChange,
     Persistence,
 )
-from custom_components.evse_bus.evse.smartevse.master import ECHO, PERIOD
+from custom_components.evse_bus.evse.smartevse.master import PERIOD
+from custom_components.evse_bus.evse.smartevse.other_masters import ECHO
 from tests.evse.smartevse.far_line import FarLine
 from tests.evse.smartevse.frames import (
     OTHER_BROADCAST,

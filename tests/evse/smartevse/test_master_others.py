@@ -9,7 +9,11 @@ from custom_components.evse_bus.evse.errors import NotAvailableError, RefusedOrd
 from custom_components.evse_bus.evse.model import Circuit, Fault, OrderChange
 from custom_components.evse_bus.evse.scan import ScanResult
 from custom_components.evse_bus.evse.smartevse import MASTER
-from custom_components.evse_bus.evse.smartevse.master import STAY_SILENT, Master
+from custom_components.evse_bus.evse.smartevse.master import (
+    LISTENING,
+    STAY_SILENT,
+    Master,
+)
 from tests.evse.simulated_line import until
 from tests.evse.smartevse.frames import OTHER_BROADCAST, frame
 from tests.evse.smartevse.scene import MasterScene
@@ -44,6 +48,9 @@ def test_another_master_is_noticed_before_our_first_broadcast() -> None:
         "001000010004080064003c00000000",
         "0910000100081000640000000000000000000000000000",
         "0910002000081000640000000000000000000000000000",
+        # Its polls of slaves that are not ours.
+        "040400a0000b",
+        "080400000008",
     ],
 )
 def test_another_master_silences_us_at_once_for_as_long_as_it_sends(head: str) -> None:
@@ -131,23 +138,57 @@ def test_other_frames_are_not_taken_for_a_master(head: str) -> None:
 
 
 @pytest.mark.parametrize("dialect", ["2.20", "2.30", "2.30+"])
-def test_another_dialect_is_not_written_to(dialect: str) -> None:
+def test_nothing_is_written_to_boxes_of_two_families(dialect: str) -> None:
+    """The broadcast for 2.20 would change error, mode and access of a later box."""
+
     async def scene() -> None:
         async with MasterScene(units=(2,)) as scene:
             scene.plug_box(3, dialect)
             slave = scene.add(3)
             await asyncio.sleep(100)
-            assert Fault.UNSUPPORTED_FIRMWARE in slave.faults
-            assert slave.reading is None
-            assert not slave.available
-            with pytest.raises(NotAvailableError, match="firmware"):
-                await slave.change_orders(OrderChange(current=10.0))
-            assert {s.data[1] for s in scene.line.sent if s.data[0] == 3} <= {3, 4}
-            # It has no share, and its value is 0.
-            assert {s.values[2] for s in scene.broadcasts()} == {0}
+            assert scene.master.noticed == {Fault.MIXED_DIALECTS}
+            # They are read all the same.
+            assert slave.available
+            assert scene.slave(2).available
+            scene.box(2).car.plug_in()
+            scene.box(3).car.plug_in()
+            for one in (slave, scene.slave(2)):
+                for change in (OrderChange(current=10.0), OrderChange(allowed=False)):
+                    with pytest.raises(NotAvailableError, match="firmware"):
+                        await one.change_orders(change)
+            await asyncio.sleep(100)
+            assert {s.data[1] for s in scene.line.sent} <= {3, 4}
+            # Without the one, it listens first, then it is the master of the other.
+            await scene.bus.remove(slave)
+            begin = now()
+            await scene.until(scene.broadcasts)
+            assert now() - begin >= LISTENING
+            assert scene.master.noticed == set()
+
+    simulate(scene())
+
+
+@pytest.mark.parametrize("then", ["2.20", "2.30", "2.17"])
+def test_another_family_than_before_is_broadcast_to_after_listening(then: str) -> None:
+    """The firmware of the only box was changed."""
+
+    async def scene() -> None:
+        dialect = "2.17" if then != "2.17" else "2.30"
+        async with MasterScene(units=(2,), dialect=dialect) as scene:
+            await asyncio.sleep(6)
+            assert scene.broadcasts()
+            changed = now()
+            scene.plug_box(2, then)
+            await scene.until(lambda: scene.slave(2).expected_dialect == then)
+            found = now()
+            await asyncio.sleep(10)
+            kinds = {bytes(sent.data[:4]) for sent in scene.broadcasts(found)}
+            assert len(kinds) == 1
+            assert kinds.isdisjoint(
+                {bytes(s.data[:4]) for s in scene.broadcasts() if s.when < changed}
+            )
+            assert scene.broadcasts(found)[0].when - found >= LISTENING
             await scene.charge(2)
-            await asyncio.sleep(3)
-            assert scene.offers == 16
 
     simulate(scene())
 

@@ -8,14 +8,13 @@ import pytest
 from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.model import Fault, OrderChange
 from custom_components.evse_bus.evse.smartevse import POLLED
-from custom_components.evse_bus.evse.smartevse.dialects import Dialect
+from custom_components.evse_bus.evse.smartevse.dialects import STOPS_ALONE, Dialect
 from custom_components.evse_bus.evse.smartevse.master import (
     LISTENING,
     STAY_SILENT,
     STILL_CHARGING,
 )
 from custom_components.evse_bus.evse.smartevse.polled import QUIET
-from custom_components.evse_bus.evse.smartevse.sharing import STOPS_ALONE
 from tests.simulated_time import now, simulate
 
 from .frames import frame

@@ -6,9 +6,13 @@ from typing import Any
 from hypothesis import given, settings, strategies as st
 import pytest
 
+from custom_components.evse_bus.evse.smartevse.dialects import (
+    FAMILIES,
+    STOPS_ALONE,
+    Family,
+)
 from custom_components.evse_bus.evse.smartevse.sharing import (
     LOWEST,
-    STOPS_ALONE,
     Claim,
     Draw,
     above_share,
@@ -18,6 +22,8 @@ from custom_components.evse_bus.evse.smartevse.sharing import (
     offered,
     split,
 )
+
+ROW = FAMILIES[Family.V2_17]
 
 
 def claims(*demands: int) -> list[Claim]:
@@ -133,7 +139,7 @@ def test_a_value_out_of_range_counts_as_the_lowest() -> None:
 
 
 def test_a_draw_counts_everything_a_box_may_be_following() -> None:
-    draw = Draw()
+    draw = Draw(ROW)
     draw.read(100, 0.0, closed=True)
     draw.sent(80, 1.0)
     assert draw.most(1.0) == 100
@@ -148,7 +154,7 @@ def test_a_draw_counts_everything_a_box_may_be_following() -> None:
 
 
 def test_a_box_that_does_not_answer_may_still_receive() -> None:
-    draw = Draw()
+    draw = Draw(ROW)
     draw.read(160, 0.0, closed=True)
     for second in range(2, 30, 2):
         draw.sent(60, second)
@@ -159,7 +165,7 @@ def test_a_box_that_does_not_answer_may_still_receive() -> None:
 
 
 def test_a_draw_is_unknown_before_the_first_broadcast() -> None:
-    draw = Draw(unknown_until=12.0)
+    draw = Draw(ROW, unknown_since=0.0)
     draw.sent(60, 5.0)
     assert draw.most(11.9) == float("inf")
     assert draw.most(12.0) == 60
@@ -168,7 +174,7 @@ def test_a_draw_is_unknown_before_the_first_broadcast() -> None:
 
 
 def test_a_grant_counts_until_a_later_broadcast_was_surely_received() -> None:
-    draw = Draw()
+    draw = Draw(ROW)
     draw.read(160, 0.0, closed=False)
     draw.granted(160, 1.0)
     draw.sent(80, 2.0)
@@ -182,7 +188,7 @@ def test_a_grant_counts_until_a_later_broadcast_was_surely_received() -> None:
 
 
 def test_a_repeated_request_does_not_undo_its_grant() -> None:
-    draw = Draw()
+    draw = Draw(ROW)
     draw.read(100, 0.0, closed=False)
     draw.granted(100, 1.0)
     draw.requested(1.1)
@@ -234,7 +240,7 @@ class World:
     gone: set[int] = field(default_factory=set)
 
     def __post_init__(self) -> None:
-        self.draws = {unit: Draw(unknown_until=STOPS_ALONE) for unit in self.slaves}
+        self.draws = {unit: Draw(ROW, unknown_since=0.0) for unit in self.slaves}
 
     def shares(self, asking: int | None = None) -> dict[int, int]:
         active = []

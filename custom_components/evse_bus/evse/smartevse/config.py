@@ -2,12 +2,10 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import ClassVar
 
 from ..model import ChargerConfig, Fact
-from .dialects import UNITS, Dialect
-
-SLAVES: Final = UNITS[2:]
+from .dialects import SLAVES, UNITS, Dialect
 
 
 def kept_dialect(text: str) -> Dialect | None:

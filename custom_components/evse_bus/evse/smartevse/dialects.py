@@ -23,6 +23,8 @@ from ..registers import Block, Registers, Word
 
 UNITS: Final = range(9)
 """Addresses: 0 (2.17 without load balancing), 1 master, 2 to 8 slaves."""
+SLAVES: Final = range(2, 9)
+"""Addresses of boxes with a master; a dialect may have fewer (`Balancing.units`)."""
 
 
 class Dialect(StrEnum):
@@ -112,9 +114,17 @@ class _StateName(Numeric[str]):
 
 
 _LETTERS: Final = "ABCDEFGH"
+ASKS_FOR_B: Final = "E"
+"""From 2.20 on: it waits for its master, and has its contactor open."""
+ASKS_FOR_C: Final = "G"
+"""Likewise: a car wants current."""
 _LETTER_STATES: Final = {ord(letter): letter for letter in f"{_LETTERS}T"}
 _NUMBER_STATES: Final = {**dict(enumerate(_LETTERS)), 8: "T"}
 _LATER_STATES: Final = {**_NUMBER_STATES, 9: "B1", 10: "C1"}
+STATE_NUMBERS: Final[Mapping[str, int]] = {
+    name: number for number, name in _LATER_STATES.items()
+}
+"""From 2.20 on."""
 MODEM_STATES: Final = range(11, 15)
 """3.x with a modem (ISO 15118): requests, waits, done, denied."""
 
@@ -204,6 +214,16 @@ def _minutes(lowest: int, highest: int) -> Number:
 
 
 # -- Load balancing ----------------------------------------------------------------
+
+STOPS_ALONE: Final = 12.0
+"""Time without a broadcast after which a box has stopped by itself, s (10 to 11; seen
+after 8.8 to 9.2)."""
+STOPS_GENTLY: Final = 18.0
+"""Likewise, where C1 holds the contactor for up to 6 s more."""
+OPENS_WITHIN: Final = 3.0
+"""Time in which a box that receives a stop obeys it, s (seen after 0.4 s)."""
+OPENS_GENTLY_WITHIN: Final = 9.0
+"""Likewise, with C1."""
 
 
 class Family(StrEnum):
@@ -335,7 +355,7 @@ PROBE_V3_OLD: Final = _read(0x0216, 1)
 
 _NODE: Final = Balancing(
     family=Family.LATER,
-    units=range(2, 9),
+    units=SLAVES,
     broadcast_unit=9,
     broadcast_register=0x0020,
     currents=8,
@@ -343,19 +363,16 @@ _NODE: Final = Balancing(
     handshake=Handshake.POLLED,
     status=_status_0000(_KELVIN, _ACCESS, words=8),
     zero_stops=True,
-    # Seen after 0.4 s, the time of the recorded car.
-    opens_within=3.0,
+    opens_within=OPENS_WITHIN,
     asks_again_after=0.0,
-    # Seen after 8.8 to 9.2 s.
-    stops_after=12.0,
+    stops_after=STOPS_ALONE,
     access_is_volatile=True,
 )
 _GENTLE_NODE: Final = replace(
-    # C1 holds the contactor for 6 s at most.
     _NODE,
-    opens_within=9.0,
+    opens_within=OPENS_GENTLY_WITHIN,
     asks_again_after=16.0,
-    stops_after=18.0,
+    stops_after=STOPS_GENTLY,
 )
 _NODE_3: Final = replace(
     _GENTLE_NODE,
@@ -425,10 +442,9 @@ MAPS: Final[Mapping[Dialect, Map]] = {
             handshake=Handshake.REQUESTS,
             status=_status_a0(_LETTER_STATES),
             zero_stops=False,
-            opens_within=3.0,
+            opens_within=OPENS_WITHIN,
             asks_again_after=0.0,
-            # 10 to 11 s.
-            stops_after=12.0,
+            stops_after=STOPS_ALONE,
             access_is_volatile=True,
         ),
         socket=Word(0xC0, Flag()),
@@ -487,6 +503,10 @@ MAPS: Final[Mapping[Dialect, Map]] = {
     Dialect.V3_OLD: replace(_VERSION_3, balancing=replace(_NODE_3, stops_after=inf)),
     Dialect.V3: _VERSION_3,
 }
+FAMILIES: Final[Mapping[Family, Balancing]] = {
+    row.balancing.family: row.balancing for row in MAPS.values()
+}
+"""A row of each family; what is broadcast is the same in all of them."""
 VERSION_3: Final = frozenset({Dialect.V3_OLD, Dialect.V3})
 LATER: Final = frozenset(Dialect) - {Dialect.V2_17, Dialect.V2_20}
 """The dialects whose status is at 0x0000."""

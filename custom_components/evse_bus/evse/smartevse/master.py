@@ -1,15 +1,16 @@
-"""Home Assistant as the load-balancing master of SmartEVSE slaves (dialect 2.17).
+"""Home Assistant as the load-balancing master of SmartEVSE slaves.
 
-One broadcast every 2 s carries the current of each slave; a slave that has received
-none for 10 s stops by itself. `sharing` decides the values; this module decides when:
-listen for another master, read the slaves, broadcast, and fall silent as soon as
-another master is on the line. Source: PROTOCOLS.md, 3.
+One broadcast every 2 s carries the current of each slave; one that has received none
+for 10 s stops by itself (all but some 3.x). `sharing` decides the values; this module
+decides when: listen for another master, read the slaves, broadcast, and fall silent as
+soon as another master is on the line. A broadcast is for the dialects of one family:
+where slaves are of two, nothing is written at all. Source: PROTOCOLS.md, 3.
 """
 
-from abc import ABC, abstractmethod
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from enum import Enum, auto
 from functools import partial
 import logging
@@ -26,12 +27,14 @@ from ..memory import LineMemory
 from ..modbus import ModbusFrame
 from ..model import Circuit, Fault
 from ..safety import Setpoint
-from .balancing import CURRENTS, broadcast, decode_request, is_foreign_broadcast
+from .balancing import broadcast, decode_request, is_foreign_broadcast
+from .dialects import FAMILIES, MAPS, Balancing, Dialect, Family
+from .member import Member
 from .memory import SmartEvseMemory
+from .other_masters import OtherMasters
 from .registers import LONGEST_REQUEST, tenths
 from .sharing import (
     LOWEST,
-    STOPS_ALONE,
     Claim,
     Draw,
     above_share,
@@ -39,6 +42,7 @@ from .sharing import (
     fit_to_limit,
     grant,
     next_values,
+    room,
     split,
 )
 
@@ -54,72 +58,22 @@ READING: Final = 1.5
 """Longest time that the first broadcast waits for the slaves to be read, s."""
 STAY_SILENT: Final = 60.0
 """Silence after the last frame of another master, s."""
-ECHO: Final = 0.5
-"""A broadcast equal to ours that comes within this time is its echo, s: a network port
-may pass it on when the next one has gone out already."""
 STILL_CHARGING: Final = 8.0
 """After a shorter silence of ours the slaves still charge: do not listen first, s."""
 RETRY: Final = 0.5
 """Pause after a turn that failed unexpectedly, s."""
 PATIENCE: Final = 3.0
 """Longest wait for a broadcast after the circuit limit has changed, s."""
+SPACING: Final = 0.03
+"""Silence before a request from 2.20 on, s: no recorded master had less."""
 
 _OTHER_MASTER: Final = (
     "another master speaks on this line; two masters would undo each other's limits"
 )
-
-
-class Slave(ABC):
-    """A slave, as its master knows it."""
-
-    available: bool
-    share: float
-    """Current that the last broadcast left for it, A."""
-    has_other_dialect: bool
-    """It does not understand our broadcasts."""
-
-    @property
-    @abstractmethod
-    def unit(self) -> int:
-        """Return its address."""
-
-    @property
-    @abstractmethod
-    def setpoint(self) -> Setpoint:
-        """Return the set-point within its `share`."""
-
-    @property
-    @abstractmethod
-    def worst_case(self) -> float | None:
-        """Return the longest time that one exchange with it can take, s."""
-
-    @abstractmethod
-    def join(self, master: Master | None) -> None:
-        """Set its master."""
-
-    @abstractmethod
-    def has_reservation(self, now: float) -> bool:
-        """Return whether a current is reserved for it that it does not draw yet."""
-
-    @abstractmethod
-    def claim(self, now: float, *, may_draw: bool) -> Claim:
-        """Return its claim to a share."""
-
-    @abstractmethod
-    def setpoint_within(self, share: float) -> Setpoint:
-        """Return the set-point within a share, A."""
-
-    @abstractmethod
-    def on_share(self, share: int, now: float) -> None:
-        """Follow a changed share, 0.1 A; 0: stop."""
-
-    @abstractmethod
-    def read_soon(self, now: float) -> None:
-        """Read its status as soon as the bus is free."""
-
-    @abstractmethod
-    async def read_status_once(self, turn: Turn) -> None:
-        """Read its status in one exchange."""
+_MIXED: Final = (
+    "the boxes on this line have firmware that needs different broadcasts; "
+    "those for one would change the settings of another"
+)
 
 
 class _Phase(Enum):
@@ -128,6 +82,8 @@ class _Phase(Enum):
     LISTENING = auto()
     READING = auto()
     BROADCASTING = auto()
+    MIXED = auto()
+    """The slaves are of two families: they are read only."""
     SILENCED = auto()
     """Another master is on the line."""
 
@@ -144,9 +100,13 @@ class Master(BusMaster):
         self._phase = _Phase.LISTENING
         self._planned = 0.0
         """Loop time of the next regular broadcast."""
-        self._unknown_until = inf
-        """Loop time at which a slave that was never read has stopped by itself."""
-        self._slaves: list[Slave] = []
+        self._unknown_since = inf
+        """Loop time since which nothing was broadcast before we began to."""
+        self._slaves: list[Member] = []
+        self._family = Family.V2_17
+        """Whom the broadcasts are for, once there are some."""
+        self._probed_at = -inf
+        """Loop time of the last turn that a slave without a reply was given."""
         self._draws: dict[int, Draw] = {}
         self._read_units: set[int] = set()
         """Units that were read, or did not reply, since we began to read them."""
@@ -156,8 +116,7 @@ class Master(BusMaster):
         """That of the line, once it is on a bus."""
         self._has_sent = False
         """One of the broadcasts so far was ours, not of an earlier bus."""
-        self._echoes: list[tuple[float, bytes]] = []
-        """Our broadcasts whose echo may still come, and when they were sent."""
+        self._others = OtherMasters()
         self._is_planned = False
         """`failed` has nothing to plan."""
         self._broadcast_sent = asyncio.Event()
@@ -199,7 +158,7 @@ class Master(BusMaster):
     # -- The slaves --------------------------------------------------------------
 
     @property
-    def slaves(self) -> list[Slave]:
+    def slaves(self) -> list[Member]:
         """Return the slaves of this bus."""
         return list(self._slaves)
 
@@ -217,20 +176,36 @@ class Master(BusMaster):
         slave = _slave(charger)
         self._slaves.append(slave)
         slave.join(self)
+        self.on_dialect()
 
     @override
     def removed(self, charger: Charger) -> None:
         slave = _slave(charger)
         self._slaves.remove(slave)
         slave.join(None)
+        draw = self._draws.get(slave.unit)
+        if draw is not None and not draw.row.fail_safe_proven and not draw.was_read:
+            # It was never seen here, and would block all others for ever.
+            del self._draws[slave.unit]
+        self.on_dialect()
 
     def draw(self, unit: int) -> Draw:
         """Return the knowledge of the current that one unit draws."""
         if unit not in self._draws:
-            draw = self._draws[unit] = Draw(self._unknown_until)
+            draw = self._draws[unit] = Draw(self._habits(unit), self._unknown_since)
             # All broadcasts so far have carried a 0 for it.
             draw.sent(0, self._sent_at)
         return self._draws[unit]
+
+    def _habits(self, unit: int) -> Balancing:
+        """Return the habits of a slave, the worst of its family if it was never read."""
+        dialects = (s.expected_dialect for s in self._slaves if s.unit == unit)
+        dialect = next(dialects, None)
+        if dialect is not None:
+            return MAPS[dialect].balancing
+        if self._family is Family.LATER:
+            return MAPS[Dialect.V3_OLD].balancing
+        return FAMILIES[self._family]
 
     def _all_draws(self) -> dict[int, Draw]:
         """Return the draws of all boxes that may follow our broadcasts.
@@ -238,16 +213,15 @@ class Master(BusMaster):
         A slave that was removed while it charged still follows them.
         """
         for slave in self.slaves:
-            self.draw(slave.unit)
-        others = {slave.unit for slave in self.slaves if slave.has_other_dialect}
-        return {u: draw for u, draw in self._draws.items() if u not in others}
+            self.draw(slave.unit).row = self._habits(slave.unit)
+        return self._draws
 
     @property
     @override
     def details(self) -> Mapping[str, object]:
         shares = {str(unit): tenths / 10 for unit, tenths in self.shares().items()}
         # Amperes, by Modbus address.
-        return {"supply": self.circuit, "shares": shares}
+        return {"supply": self.circuit, "shares": shares, "family": self._family}
 
     def shares(self) -> dict[int, int]:
         """Return the share of each slave once all have followed, 0.1 A.
@@ -264,7 +238,7 @@ class Master(BusMaster):
         ]
         idle: list[Claim] = []
         for unit, slave in slaves.items():
-            claim = slave.claim(now, may_draw=draws[unit].may_draw)
+            claim = slave.claim(now, may_draw=draws[unit].may_charge(now))
             (claims if self._is_active(slave, now) else idle).append(claim)
         shares = split(self._limit, self._minimum, claims)
         for claim in idle:
@@ -284,20 +258,25 @@ class Master(BusMaster):
             for slave in self.slaves
             if self._is_active(slave, now)
             # One that draws nothing and has no share takes nothing from the others.
-            and (values.get(slave.unit) or self.draw(slave.unit).may_draw)
+            and (values.get(slave.unit) or draws[slave.unit].may_charge(now))
         ]
-        return fit_to_limit(self._limit - taken, values, active)
+        stopped = {unit for unit, draw in draws.items() if draw.row.zero_stops}
+        return fit_to_limit(self._limit - taken, values, active, stopped)
 
-    def _is_active(self, slave: Slave, now: float) -> bool:
+    def _is_active(self, slave: Member, now: float) -> bool:
         """Return whether a slave may draw current, or is about to."""
-        return self.draw(slave.unit).may_draw or slave.has_reservation(now)
+        return self.draw(slave.unit).may_charge(now) or slave.has_reservation(now)
+
+    def room(self, unit: int) -> float:
+        """Return the current that the others leave for a unit now, 0.1 A."""
+        return room(unit, self._limit, self._all_draws(), self.now)
 
     def grant(self, unit: int) -> int:
         """Return the current that may be granted to this unit now, 0.1 A; 0: none."""
         share = self.shares().get(unit, 0)
         return grant(self._limit, share, unit, self._all_draws(), self.now)
 
-    def above_share(self, unit: int) -> list[Slave]:
+    def above_share(self, unit: int) -> Sequence[Member]:
         """Return the slaves that must go down before this one may begin.
 
         Those that do not answer are left out: they cannot confirm it.
@@ -307,7 +286,7 @@ class Master(BusMaster):
             slave for slave in self.slaves if slave.unit in units and slave.available
         ]
 
-    async def lower(self, turn: Turn, slaves: list[Slave]) -> None:
+    async def lower(self, turn: Turn, slaves: Sequence[Member]) -> None:
         """Broadcast lower values, then read them back: a conversation.
 
         A slave whose reading fails is left as it is. Raises what `Turn.send` raises.
@@ -320,12 +299,17 @@ class Master(BusMaster):
 
     # -- Readings of the slaves --------------------------------------------------
 
-    def on_status(self, unit: int, value: int, *, closed: bool, complete: bool) -> None:
+    def on_status(
+        self, unit: int, value: int, *, closed: bool, ending: bool, complete: bool
+    ) -> None:
         """Note a status: the current read back, 0.1 A, and the contactor.
 
-        ``complete``: the settings of the slave are known, too.
+        ``ending``: the pilot offers nothing any more. ``complete``: the settings of
+        the slave are known, too.
         """
-        self.draw(unit).read(value, self.now, closed=closed)
+        draw = self.draw(unit)
+        draw.row = self._habits(unit)
+        draw.read(value, self.now, closed=closed, ending=ending)
         if complete:
             self._on_read(unit)
         self.update_shares()
@@ -370,47 +354,52 @@ class Master(BusMaster):
     def _setpoints(self, now: float) -> tuple[int, ...]:
         """Return the values that a broadcast would carry now, 0.1 A."""
         values = self._next_values(now)
-        by_unit = {
-            slave.unit: tenths(slave.setpoint_within(values[slave.unit] / 10))
-            for slave in self.slaves
-            if slave.unit in values
-        }
-        return tuple(by_unit.get(unit, 0) for unit in range(1, CURRENTS + 1))
+        return self._by_unit(
+            {
+                slave.unit: slave.setpoint_within(values[slave.unit] / 10)
+                for slave in self.slaves
+            }
+        )
+
+    def _by_unit(self, setpoints: Mapping[int, Setpoint]) -> tuple[int, ...]:
+        """Return the values of a broadcast, for unit 1, 2 and so on, 0.1 A."""
+        units = range(1, FAMILIES[self._family].currents + 1)
+        return tuple(tenths(setpoints[u]) if u in setpoints else 0 for u in units)
 
     def _broadcast(self) -> bytes:
         """Return the broadcast of this moment, which must be sent now."""
         now = self.now
         values = self._next_values(now)
-        by_unit: dict[int, Setpoint] = {}
+        setpoints: dict[int, Setpoint] = {}
         for slave in self.slaves:
-            if slave.unit in values:
-                slave.share = values[slave.unit] / 10
-                by_unit[slave.unit] = slave.setpoint
-        setpoints = [by_unit.get(unit) for unit in range(1, CURRENTS + 1)]
+            slave.share = values[slave.unit] / 10
+            setpoints[slave.unit] = slave.setpoint
         before = self._values
-        self._values = tuple(0 if one is None else tenths(one) for one in setpoints)
+        self._values = self._by_unit(setpoints)
         for unit, draw in self._draws.items():
             draw.sent(self._values[unit - 1], now)
         for slave in self.slaves:
             lower = before and self._values[slave.unit - 1] < before[slave.unit - 1]
-            if lower and self.draw(slave.unit).may_draw:
+            if lower and self.draw(slave.unit).may_charge(now):
                 # Until it has confirmed that, no other slave can go up.
                 slave.read_soon(now)
-        frame = broadcast(setpoints)
+        frame = broadcast(self._family, setpoints)
         self._memory.broadcast_at = now
         self._has_sent = True
-        self._echoes = [one for one in self._echoes if now - one[0] <= ECHO]
-        self._echoes.append((now, frame))
+        self._others.sent(frame, now)
         self._broadcast_sent.set()
         return frame
 
     async def send_broadcast(self, turn: Turn) -> None:
         """Broadcast in any turn; raises what `Turn.send` raises.
 
-        Has no effect before the slaves were read.
+        Has no effect before the slaves were read. Raises NotAvailableError where they
+        are of two families.
         """
+        if self._phase is _Phase.MIXED:
+            raise _mixed()
         if self._phase is _Phase.BROADCASTING:
-            await turn.send(partial(self.unless_silent, self._broadcast))
+            await turn.send(partial(self.unless_forbidden, self._broadcast))
 
     @override
     async def turn(self, turn: Turn) -> None:
@@ -419,9 +408,9 @@ class Master(BusMaster):
             self._start_reading(now)
             return
         if self._phase is _Phase.READING:
-            _LOGGER.debug("Master of %s slaves", len(self.slaves))
-            self._phase = _Phase.BROADCASTING
-            self._planned = now
+            self._begin(now)
+        if self._phase is not _Phase.BROADCASTING:
+            return
         if not self.slaves:
             # A scan or an empty bus: other boxes must not follow us.
             self._planned = now + PERIOD
@@ -435,6 +424,28 @@ class Master(BusMaster):
             self._is_planned = True
             raise
         self._plan_next(now)
+
+    def _begin(self, now: float) -> None:
+        """Broadcast from now on, to the family that was found."""
+        families = self._families()
+        if len(families) > 1:
+            self._stop_for_mix()
+            return
+        # Before any slave was read: only 2.17 hears that, and the others ignore it.
+        self._family = next(iter(families), Family.V2_17)
+        self._set_spacing()
+        self.notice(Fault.MIXED_DIALECTS, present=False)
+        _LOGGER.debug("Master of %s slaves (%s)", len(self.slaves), self._family)
+        self._phase = _Phase.BROADCASTING
+        self._planned = now
+
+    def _set_spacing(self) -> None:
+        if self.bus is None or self._family is Family.V2_17:
+            return
+        wire = self.bus.wire
+        if wire.timing.silence < SPACING:
+            wire.timing = replace(wire.timing, silence=SPACING)
+            wire.on_times_changed()
 
     def _plan_next(self, now: float) -> None:
         """Plan the next broadcast, whenever this one went."""
@@ -457,6 +468,53 @@ class Master(BusMaster):
         if not self._is_planned and not self.silent:
             self._plan(now + RETRY, now + RETRY)
         self._is_planned = False
+
+    # -- Families ----------------------------------------------------------------
+
+    def _families(self) -> set[Family]:
+        """Return the families of the slaves, as read last or kept from earlier."""
+        dialects = {slave.expected_dialect for slave in self._slaves} - {None}
+        return {MAPS[one].balancing.family for one in dialects if one is not None}
+
+    def on_dialect(self) -> None:
+        """Look again at the dialects of all slaves: one was read, or is gone."""
+        families = self._families()
+        if len(families) > 1:
+            if self._phase is _Phase.BROADCASTING:
+                self._stop_for_mix()
+        elif self._phase is _Phase.MIXED or (
+            self._phase is _Phase.BROADCASTING
+            and families
+            and self._family not in families
+        ):
+            # To other boxes than before: only after it has listened.
+            self._listen(self.now)
+            if self.bus is not None:
+                self.bus.reschedule()
+
+    def _stop_for_mix(self) -> None:
+        """Write nothing more: the slaves stop by themselves, as far as they do."""
+        self._phase = _Phase.MIXED
+        self._wait(inf)
+        if self.bus is not None:
+            _LOGGER.warning("%s: %s", self.bus.name, _MIXED)
+        self.notice(Fault.MIXED_DIALECTS, present=True)
+
+    def unless_forbidden(self, request: Request) -> bytes:
+        """Return the bytes of a request that writes; as `unless_silent`.
+
+        Raises NotAvailableError also where the slaves are of two families.
+        """
+        if len(self._families()) > 1:
+            raise _mixed()
+        return self.unless_silent(request)
+
+    # -- Slaves that do not reply ------------------------------------------------
+
+    def next_probe(self, now: float) -> float:
+        """Return when one that has not replied is to be read again: one a period."""
+        self._probed_at = max(now, self._probed_at) + PERIOD
+        return self._probed_at
 
     # -- Other masters -----------------------------------------------------------
 
@@ -493,16 +551,20 @@ class Master(BusMaster):
             # The slaves still charge by our last broadcast: the next one comes soon.
             if not self._has_sent:
                 # What an earlier bus has left them is not known.
-                self._forget(now + STOPS_ALONE)
+                self._forget(now)
             self._start_reading(now)
             return
+        self._listen(now)
+
+    def _listen(self, now: float) -> None:
+        """Listen for another master; then read the slaves anew."""
         self._phase = _Phase.LISTENING
-        self._forget(now + STOPS_ALONE)
+        self._forget(now)
         self._wait(now + LISTENING)
 
-    def _forget(self, unknown_until: float) -> None:
+    def _forget(self, now: float) -> None:
         """Drop all that is known of the slaves' currents."""
-        self._unknown_until = unknown_until
+        self._unknown_since = now
         self._draws.clear()
         self._read_units.clear()
         self._values = ()
@@ -519,11 +581,10 @@ class Master(BusMaster):
         if not isinstance(frame, ModbusFrame):
             return False
         now = self.now
+        if self._others.is_one(frame, self._draws, now):
+            self._fall_silent(now)
+            return True
         if is_foreign_broadcast(frame):
-            if not any(
-                raw == frame.raw and now - when <= ECHO for when, raw in self._echoes
-            ):
-                self._fall_silent(now)
             return True
         request = decode_request(frame)
         if request is not None and request.unit in self._draws:
@@ -537,7 +598,7 @@ class Master(BusMaster):
         self._phase = _Phase.SILENCED
         # The next bus on this line must listen first, however soon it comes.
         self._memory.broadcast_at = -inf
-        self._forget(now + STOPS_ALONE)
+        self._forget(now)
         self._wait(now + STAY_SILENT)
         self.notice(Fault.SECOND_MASTER, present=True)
         if is_new and self.bus is not None:
@@ -549,8 +610,12 @@ def _other_master() -> NotAvailableError:
     return NotAvailableError(_OTHER_MASTER, "smartevse_other_master")
 
 
-def _slave(charger: Charger) -> Slave:
-    if not isinstance(charger, Slave):
+def _mixed() -> NotAvailableError:
+    return NotAvailableError(_MIXED, "smartevse_mixed_dialects")
+
+
+def _slave(charger: Charger) -> Member:
+    if not isinstance(charger, Member):
         message = f"{charger.config.name} is no slave of a SmartEVSE master"
         raise TypeError(message)
     return charger

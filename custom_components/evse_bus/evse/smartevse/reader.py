@@ -32,7 +32,7 @@ from ..model import (
     Setting,
 )
 from ..pause_watch import FOLLOW_TIME
-from ..registers import Block
+from ..registers import Block, Registers
 from .config import SmartEvseConfig
 from .dialects import LATER, MAPS, PROBE_A0, Dialect, Status
 from .probing import find_dialect
@@ -275,10 +275,10 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
         nothing), WrongChargerError, and what `read` raises.
         """
         dialect = self.known_dialect
+        registers = self.status_registers(dialect, turn.now)
         try:
-            status = decode_status(
-                dialect, await self.read(turn, MAPS[dialect].status.block)
-            )
+            data = await self.read(turn, registers.block)
+            status = decode_status(dialect, data, registers)
         except ExchangeRefusedError as error:
             if error.code == ILLEGAL_ADDRESS:
                 # Its firmware has changed.
@@ -291,8 +291,20 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
             raise
         self._implausible_replies = 0
         self.notice(Fault.IMPLAUSIBLE, present=False)
-        self._check_identity(status)
+        if registers is MAPS[dialect].status or self.status is None:
+            self._check_identity(status)
+        else:
+            # The shorter block of a master is without these.
+            status = replace(
+                status,
+                temperature=self.status.temperature,
+                serial=self.status.serial,
+            )
         self.on_status(status, turn.now)
+
+    def status_registers(self, dialect: Dialect, now: float) -> Registers[Status]:  # noqa: ARG002
+        """Return the block of the next status."""
+        return MAPS[dialect].status
 
     def _start_over(self) -> None:
         """Drop what is known of a box that does not reply as it did before."""

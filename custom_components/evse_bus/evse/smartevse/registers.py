@@ -23,12 +23,12 @@ from ..modbus import (
     write_registers,
 )
 from ..model import Mode, Setting
-from ..registers import Block, Word, words_of
+from ..registers import Block, Registers, Word, words_of
 from ..safety import Setpoint
 from .dialects import MAPS, MODES, UNITS, Dialect, Status
 
-LONGEST_REQUEST: Final = 17
-"""Bytes: the broadcast of four currents."""
+LONGEST_REQUEST: Final = 25
+"""Bytes: the broadcast of eight currents."""
 LONGEST_REPLY: Final = 64
 
 ILLEGAL_ADDRESS: Final = 2
@@ -46,13 +46,15 @@ class MalformedRefusalError(ExchangeRefusedError):
     """An exception without the 0x80 in its function, as 2.x sends it."""
 
 
-def decode_status(dialect: Dialect, data: bytes) -> Status:
+def decode_status(
+    dialect: Dialect, data: bytes, registers: Registers[Status] | None = None
+) -> Status:
     """Return the contents of a status block of this dialect.
 
-    Raises ImplausibleReplyError for contents that no SmartEVSE of this dialect has.
+    ``registers``: the block, if not that of `Map.status`. Raises ImplausibleReplyError for contents that no SmartEVSE of this dialect has.
     """
     try:
-        return MAPS[dialect].status.decode(data)
+        return (registers or MAPS[dialect].status).decode(data)
     except ImplausibleReplyError as error:
         message = f"not the status of a SmartEVSE ({dialect}): {error}: {data.hex()}"
         raise ImplausibleReplyError(message) from error
@@ -190,8 +192,10 @@ def write_setting(unit: int, dialect: Dialect, setting: Setting, value: int) -> 
     return _write(unit, word.register, word.kind.named(setting).raw(value))
 
 
-def write_answer(unit: int, register: int) -> Callable[[ModbusFrame], bool | None]:
-    """Return a matcher for the reply to a write of one register.
+def write_answer(
+    unit: int, register: int, words: int = 1
+) -> Callable[[ModbusFrame], bool | None]:
+    """Return a matcher for the reply to a write of registers.
 
     True: accepted. False: unknown until it is read back, since 2.17 answers
     ``00 10 03 3c 01`` to an override that it accepts. It raises ExchangeRefusedError
@@ -202,8 +206,12 @@ def write_answer(unit: int, register: int) -> Callable[[ModbusFrame], bool | Non
         if frame.unit != unit:
             return None
         code = refusal_code(frame, WRITE_MULTIPLE_REGISTERS)
+        if code is None and is_written(frame, register, words):
+            return True
         if code is None:
-            return True if is_written(frame, register, 1) else None
+            # It confirms the number of values it took.
+            taken = any(is_written(frame, register, n) for n in range(words))
+            return False if taken else None
         if code == ILLEGAL_VALUE:
             return False
         message = f"the box refused to write {register:#06x}: exception {code}"

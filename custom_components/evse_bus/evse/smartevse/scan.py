@@ -24,8 +24,7 @@ from ..model import ChargerConfig, FailSafe, Fault, Orders, Setting
 from ..protocol import Progress
 from ..registers import Block
 from ..scan import FoundCharger, ScanResult
-from .config import SLAVES
-from .dialects import MAPS, PROBE_A0, Dialect, Status
+from .dialects import MAPS, PROBE_A0, SLAVES, Dialect, Status
 from .memory import SmartEvseMemory
 from .polled import QUIET
 from .probing import Read, find_dialect

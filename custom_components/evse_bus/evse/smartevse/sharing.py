@@ -1,25 +1,28 @@
-"""Sharing a circuit limit among the slaves of one master. Pure: no clock, no line.
+"""Sharing a circuit limit among the boxes of one master. Pure: no clock, no line.
 
 All currents are whole 0.1 A, as they go to the wire; times are loop times, s.
 
-A slave (dialect 2.17) closes its contactor only when its request for current is
-granted. From then on it offers the current that was granted, or that of the last
-broadcast it received. A broadcast may get lost, so a `Draw` counts every value that a
-box may be following, and a value goes up only by the current that all of these leave
-free: first the others go down and confirm it, then one goes up. Then, whatever gets
-lost and whichever box falls silent, all boxes together never offer more than the
-limit, as long as two conditions hold, which no master can bring about:
+A box closes its contactor only when its request for current is granted. From then on it
+offers the current that was granted (2.17), or that of the last broadcast it received. A
+broadcast may get lost, so a `Draw` counts every value that a box may be following, and a
+value goes up only by the current that all of these leave free: first the others go down
+and confirm it, then one goes up. Then, whatever gets lost and whichever box falls
+silent, all boxes together never offer more than the limit, as long as two conditions
+hold, which no master can bring about:
 
-- The limit leaves 6 A for every box that charges. Where it does not (it was lowered,
-  or a box cannot be reached), a box goes on with 6 A until it has received the command
-  to stop, which is sent at once, or until it has missed all broadcasts for 10 s.
+- The limit leaves 6 A for every box that charges and goes on with 6 A after a value of 0
+  (2.17). Where it does not (it was lowered, or a box cannot be reached), a box goes on
+  with 6 A until it has received the command to stop, which is sent at once, or until it
+  has missed all broadcasts for long enough.
 - Before our first broadcast the boxes together kept to the limit. Until each of them
   was read, or has had time to stop by itself, none goes up.
 
-Source: PROTOCOLS.md, 3, and the manual's registers 0x00* and 0x008*.
+What a box does with a 0, and when it stops by itself, differs by its dialect
+(`dialects.Balancing`). Source: PROTOCOLS.md, 3, and the manual's registers 0x00* and
+0x008*.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import inf
 from typing import Final
@@ -27,13 +30,12 @@ from typing import Final
 from ..errors import RefusedOrderError
 from ..model import MAXIMUM_CURRENT, MINIMUM_CURRENT, Circuit
 from ..safety import number, round_down
+from .dialects import Balancing, Handshake
 
 LOWEST: Final = 60
 """0.1 A; a box that charges offers no less, whatever it receives."""
 HIGHEST: Final = 800
 """0.1 A; a box ignores a higher value, and offers the lowest."""
-STOPS_ALONE: Final = 12.0
-"""Time without a broadcast after which a box has stopped by itself, s (10 to 11)."""
 
 _STEP: Final = 0.1
 """A, on the wire."""
@@ -60,13 +62,20 @@ def offered(value: int) -> int:
 class Draw:
     """The most that one box may be offering a car, from all that is known of it."""
 
-    def __init__(self, unknown_until: float = -inf) -> None:
-        """Know nothing; an earlier charge has stopped by ``unknown_until``."""
+    def __init__(self, row: Balancing, unknown_since: float | None = None) -> None:
+        """Take the habits of its dialect.
+
+        ``unknown_since``: an earlier charge may be going on, and nothing was broadcast
+        since then; ``None``: there was none.
+        """
+        self.row = row
+        """The habits of its dialect."""
         self.may_draw = True
         """Its contactor may be closed; only a reading can show that it is not."""
-        self._unknown_until = unknown_until
+        self._unknown_since = unknown_since
         self._read: tuple[float, int] | None = None
-        self._sent: list[tuple[float, int]] = []
+        self._sent: dict[int, float] = {}
+        """Values since the last reading, and when each was sent last."""
         self._granted: tuple[float, int] | None = None
         self._floor: int | None = None
 
@@ -74,14 +83,42 @@ class Draw:
         """Return the most that it may be offering now, 0.1 A; inf: unknown."""
         if not self.may_draw:
             return 0
-        if now < self._unknown_until:
+        stops_after = self.row.stops_after
+        if self._unknown_since is not None and now < self._unknown_since + stops_after:
             return inf
         # The value it follows is younger than that, or it has stopped.
-        recent = now - STOPS_ALONE
-        values = [value for when, value in self._sent if when > recent]
+        recent = now - stops_after
+        values = [
+            self.follows(value) for value, when in self._sent.items() if when > recent
+        ]
         others = (one for one in (self._read, self._granted) if one is not None)
         values.extend(value for when, value in others if when > recent)
         return max(values, default=0)
+
+    def follows(self, value: int) -> int:
+        """Return the current it offers after a value while it charges, 0.1 A."""
+        return 0 if self.row.zero_stops and not value else offered(value)
+
+    def may_charge(self, now: float) -> bool:
+        """Return whether it may be charging, or go on with it after a value above 0."""
+        # A value of 0 stops 2.17 in no case, so it may charge until it was read.
+        return self.may_draw and not (self.row.zero_stops and self.most(now) == 0)
+
+    @property
+    def at_grant(self) -> int:
+        """Return the most that it may offer if its request is granted now, 0.1 A.
+
+        From 2.20 on: that of the last broadcast which it has received.
+        """
+        values = [offered(value) for value in self._sent]
+        if self._read is not None:
+            values.append(self._read[1])
+        return max(values, default=LOWEST)
+
+    @property
+    def was_read(self) -> bool:
+        """Return whether a reading has shown what it offers."""
+        return self._read is not None
 
     @property
     def floor(self) -> int:
@@ -90,9 +127,7 @@ class Draw:
 
     def sent(self, value: int, now: float) -> None:
         """Note a value of a broadcast that is sent now; it may get lost."""
-        recent = now - STOPS_ALONE
-        self._sent = [one for one in self._sent if one[0] > recent]
-        self._sent.append((now, offered(value)))
+        self._sent[value] = now
         if self._floor is not None:
             self._floor = min(self._floor, value)
 
@@ -108,18 +143,40 @@ class Draw:
             value = max(value, self._granted[1])
         self._granted = (now, offered(value))
 
-    def read(self, value: int, now: float, *, closed: bool) -> None:
-        """Note a reading: the value the box received last, and its contactor."""
+    def granted_as_broadcast(self, now: float) -> None:
+        """Note that a request is granted now which needs no value (from 2.20 on)."""
+        self._granted = (now, self.at_grant)
+        self.may_draw = True
+
+    def read(
+        self, value: int, now: float, *, closed: bool, ending: bool = False
+    ) -> None:
+        """Note a reading: the value the box received last, and its contactor.
+
+        ``ending``: it offers nothing any more (C1), but the car may not have followed.
+        """
+        if ending:
+            most = self.most(now)
+            self.may_draw = True
+            if most < inf:
+                self._unknown_since = None
+                self._read = (now, max(int(most), offered(value)))
+            return
         self.may_draw = closed
-        self._unknown_until = -inf
+        self._unknown_since = None
         self._read = (now, offered(value))
         self._sent.clear()
         self._floor = value
+        if not closed or self._has_received_since_grant(value):
+            self._granted = None
+
+    def _has_received_since_grant(self, value: int) -> bool:
+        """Return whether the value it has received shows what it offers."""
+        if self.row.handshake is Handshake.POLLED:
+            return True
         # No lower value was sent before the grant: so it has received a broadcast
         # since. (0 may also be the memory of a box that was switched off and on.)
-        grant = self._granted
-        if not closed or (grant is not None and 0 < value < grant[1]):
-            self._granted = None
+        return self._granted is not None and 0 < value < self._granted[1]
 
     def requested(self, now: float) -> None:
         """Note a request: a box that requests current has its contactor open.
@@ -127,7 +184,7 @@ class Draw:
         Unless a request was granted of late: then this one may be an echo of it, and
         only a reading counts.
         """
-        if self._granted is None or now - self._granted[0] > STOPS_ALONE:
+        if self._granted is None or now - self._granted[0] > self.row.stops_after:
             self.may_draw = False
             self._granted = None
 
@@ -195,7 +252,7 @@ def next_values(
         value = share
         if most == inf:
             value = min(share, LOWEST)
-        elif draw.may_draw and share > most:
+        elif draw.may_charge(now) and share > most:
             more = int(min(free, share - most))
             free -= more
             value = int(most) + more
@@ -204,18 +261,26 @@ def next_values(
 
 
 def fit_to_limit(
-    limit: int, values: Mapping[int, int], active: Iterable[int]
+    limit: int,
+    values: Mapping[int, int],
+    active: Iterable[int],
+    stopped_by_zero: Collection[int] = (),
 ) -> dict[int, int]:
     """Return the values with which one broadcast keeps to the limit, 0.1 A.
 
-    The ``active`` units draw current, or are about to. Where they would offer too
+    The ``active`` units draw current, or are about to; a 0 stops ``stopped_by_zero``,
+    and takes nothing. Where they would offer too
     much, because one is still being stopped, the others go down to the lowest
     meanwhile. The rest goes in equal parts to boxes that draw nothing, so that the sum
     of all values of a broadcast is never above the limit.
     """
     active = [unit for unit in values if unit in set(active)]
     fitted = dict(values)
-    left = limit - sum(offered(fitted[unit]) for unit in active)
+    left = limit - sum(
+        offered(fitted[unit])
+        for unit in active
+        if fitted[unit] or unit not in stopped_by_zero
+    )
     for unit in active:
         less = min(max(-left, 0), max(fitted[unit] - LOWEST, 0))
         fitted[unit] -= less
@@ -228,6 +293,13 @@ def fit_to_limit(
     return fitted
 
 
+def room(unit: int, limit: int, draws: Mapping[int, Draw], now: float) -> float:
+    """Return the current that the others leave for a unit now, 0.1 A; may be -inf."""
+    return limit - most_of_all(
+        (draw for other, draw in draws.items() if other != unit), now
+    )
+
+
 def grant(
     limit: int, share: int, unit: int, draws: Mapping[int, Draw], now: float
 ) -> int:
@@ -237,9 +309,7 @@ def grant(
     surely received in broadcasts (or the lowest): then a lower value in a later
     reading shows that it has received a later broadcast.
     """
-    free = limit - most_of_all(
-        (draw for other, draw in draws.items() if other != unit), now
-    )
+    free = room(unit, limit, draws, now)
     if share < LOWEST or free < LOWEST:
         return 0
     value = int(min(free, share, max(LOWEST, draws[unit].floor)))
@@ -253,5 +323,7 @@ def above_share(
 ) -> Sequence[int]:
     """Return the units that may still be offering more than their share."""
     return [
-        unit for unit, share in shares.items() if draws[unit].most(now) > offered(share)
+        unit
+        for unit, share in shares.items()
+        if draws[unit].most(now) > draws[unit].follows(share)
     ]

@@ -1,8 +1,9 @@
-"""One SmartEVSE slave under Home Assistant as load-balancing master (dialect 2.17).
+"""One SmartEVSE slave under Home Assistant as load-balancing master.
 
 Its current is a value of the master's broadcast; only its access bit and the answers to
-its requests are addressed to it alone. A broadcast of 0 A does not stop it (it then
-offers 6 A): a pause is its access bit, confirmed when the box has obeyed it.
+its requests are addressed to it alone. A pause is its access bit where that is not kept
+in its flash memory (2.17 goes on with 6 A after a broadcast of 0), else a broadcast of
+0 and the refusal of its requests. It is confirmed when the box has obeyed it.
 PROTOCOLS.md, 3.
 """
 
@@ -13,12 +14,12 @@ from functools import partial
 from math import inf
 from typing import ClassVar, Final, override
 
-from ..conversation import FollowUp, nothing, rest
+from ..conversation import FollowUp, rest
 from ..errors import (
     EvseError,
-    LineBusyError,
     NotAvailableError,
     NotConfirmedError,
+    ReplyTimeoutError,
 )
 from ..exchange import Request, Turn
 from ..framing import Frame
@@ -35,42 +36,47 @@ from ..model import (
     Range,
     Setting,
 )
+from ..registers import Registers
 from ..safety import Setpoint, clamp
 from ..schedule import Kind
-from .balancing import RequestKind, SlaveRequest, acknowledge, decode_request
+from .balancing import answer_to_state, decode_request
 from .charger import SmartEvseCharger
 from .config import SlaveConfig
-from .dialects import Dialect, Status
-from .master import Master, Slave
+from .dialects import (
+    ASKS_FOR_B,
+    ASKS_FOR_C,
+    MAPS,
+    OPENS_WITHIN,
+    Balancing,
+    Dialect,
+    Handshake,
+    Status,
+)
+from .handshake_polled import PolledHandshake
+from .handshake_requests import RequestHandshake
+from .member import Balancer, Member
 from .reader import READ_AGAIN
 from .registers import LONGEST_REQUEST, tenths
 from .sharing import LOWEST, Claim
-from .states import CHARGING, UNPLUGGED, is_stopped
+from .states import CHARGING, STOPPING, UNPLUGGED, is_stopped
 
-STOPS_WITHIN: Final = 3.0
-"""Time in which a box that receives a stop obeys it, s."""
 WITHHELD_FOR: Final = 60.0
-"""Shortest pause of a box that was stopped for lack of current, s."""
-RESERVED_FOR: Final = 10.0
-"""Time for which the share of a car that was granted current waits for it, s."""
+"""Shortest pause of a box of 2.17 that was stopped for lack of current, s."""
+WITHHELD_POLLED: Final = 15.0
+"""Likewise from 2.20 on, s: a refused box waits for a minute by itself."""
 BROADCASTS: Final = 4
 """Attempts to broadcast a new current, each followed by its read-back."""
-ANSWER_WITHIN: Final = 0.8
-"""Latest answer to a request, s: after 1 s the box has given it up, and would close its
-contactor on a late answer all the same. It asks again."""
-ROUNDS: Final = 2
-"""Attempts to lower the others for one request."""
-OTHER_DIALECT_INTERVAL: Final = 30.0
-"""Pause between two readings of a box of another dialect, s."""
+LONG_STATUS_INTERVAL: Final = 30.0
+"""Time between two readings of temperature and serial number, which are not in the
+block that a master polls, s."""
 
-_OTHER_HANDSHAKE: Final = "its firmware has another handshake"
 _ANSWER_BYTES: Final = LONGEST_REQUEST
 """A turn that answers may have a broadcast instead."""
-_FOR_CURRENT: Final = frozenset({RequestKind.B, RequestKind.C})
-"""Requests that are granted a current."""
+_OPEN: Final = frozenset({UNPLUGGED, "B", "B1", "T", "F", ASKS_FOR_B, ASKS_FOR_C})
+"""From 2.20 on: the states in which the contactor is surely open."""
 
 
-class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
+class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Member):
     """One slave."""
 
     pauses_hurry: ClassVar = True
@@ -79,10 +85,13 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
         """Begin with an unknown box, without a share of the circuit limit."""
         super().__init__(config, orders)
         self.share = 0.0
-        self.has_other_dialect = False
-        self._master: Master | None = None
-        self._own_maximum: float | None = None
-        """The maximum of box and cable, as in its last request, A."""
+        self.expected_dialect = config.dialect
+        self._master: Balancer | None = None
+        self._requests = RequestHandshake(self)
+        self._polled = PolledHandshake(self)
+        self._cable: int | None = None
+        """From 2.20 on: maximum of its cable, A; ``None``: no car is plugged in."""
+        self._long_status_due = -inf
         self._charging_since = inf
         self._reserved_until = -inf
         self._withheld_at: float | None = None
@@ -92,11 +101,10 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
         """Readings in a row that were above its share."""
         self._paused_by_us = False
         """We have turned its access off for lack of current."""
+        self._is_leaving = False
+        """It will receive no more broadcasts, and must not go on."""
         self._confirming: OrderChange | None = None
         """The change of orders under way."""
-        self._answering: dict[RequestKind, float] = {}
-        """Requests being answered, and until when their repetition is ignored."""
-        self._read_dialect_at = -inf
 
     # -- Capabilities and limits ---------------------------------------------------
 
@@ -106,7 +114,19 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
         return self.config.address
 
     @property
-    def master(self) -> Master:
+    def _habits(self) -> Balancing | None:
+        """Return the habits of its dialect, as read last; ``None``: never read."""
+        if self.expected_dialect is None:
+            return None
+        return MAPS[self.expected_dialect].balancing
+
+    @property
+    def _is_polled(self) -> bool:
+        habits = self._habits
+        return habits is not None and habits.handshake is Handshake.POLLED
+
+    @property
+    def master(self) -> Balancer:
         """Return the master; raises NotAvailableError without one."""
         if self._master is None:
             message = f"{self.config.name} is on no bus with a master"
@@ -114,7 +134,7 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
         return self._master
 
     @override
-    def join(self, master: Master | None) -> None:
+    def join(self, master: Balancer | None) -> None:
         self._master = master
 
     @property
@@ -124,8 +144,16 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
 
     @property
     @override
-    def fail_safe(self) -> FailSafe:
-        return FailSafe.STOPS
+    def send_time(self) -> float | None:
+        return self.bus.wire.send_time(_ANSWER_BYTES) if self.bus is not None else None
+
+    @property
+    @override
+    def fail_safe(self) -> FailSafe | None:
+        habits = self._habits
+        if habits is None:
+            return None
+        return FailSafe.STOPS if habits.fail_safe_proven else FailSafe.NOTHING
 
     @property
     @override
@@ -148,7 +176,18 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
     @override
     def limits(self) -> Limits:
         known = super().limits
-        maxima = [one for one in (known.reported, self._own_maximum) if one is not None]
+        if self._is_polled:
+            # Until the cable of the next car was measured: 6 A.
+            reported = None if self._cable is None else known.reported
+            if reported is not None and self._cable is not None:
+                reported = min(reported, self._cable)
+            return Limits(
+                installation=known.installation,
+                reports_maximum=True,
+                reported=reported,
+            )
+        own = self._requests.own_maximum
+        maxima = [one for one in (known.reported, own) if one is not None]
         # The minimum in the memory of a slave applies to masters only.
         return Limits(
             installation=known.installation,
@@ -157,8 +196,8 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
         )
 
     @property
+    @override
     def wanted(self) -> Setpoint:
-        """Return the set-point with the whole circuit limit as its share."""
         return clamp(self._standing, self.limits)
 
     @property
@@ -171,6 +210,8 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
     @override
     def setpoint_within(self, share: float) -> Setpoint:
         limits = self.limits
+        if self._is_leaving:
+            share = 0.0
         return clamp(
             self._standing, replace(limits, reported=min(share, limits.ceiling))
         )
@@ -194,33 +235,55 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
     # -- Its share -----------------------------------------------------------------
 
     @property
+    @override
     def withheld(self) -> bool:
-        """Return whether it must not charge because its share is too small."""
         return self._withheld_at is not None
 
     @property
+    @override
     def may_begin(self) -> bool:
-        """Return whether neither its orders nor its share forbid it to charge."""
-        return not self.wanted.paused and not self.withheld
+        return not self._is_paused and not self.withheld
+
+    @property
+    def _is_paused(self) -> bool:
+        """Return whether its orders, or our end, forbid it to charge."""
+        return self.wanted.paused or self._is_leaving
 
     @override
     def has_reservation(self, now: float) -> bool:
         return now < self._reserved_until
 
     @override
+    def reserve(self, until: float) -> None:
+        self._reserved_until = until
+
+    @override
+    def begins(self, now: float) -> None:
+        self._charging_since = min(self._charging_since, now)
+
+    @override
     def claim(self, now: float, *, may_draw: bool) -> Claim:
-        demand = tenths(self.wanted)
+        demand = 0 if self._is_leaving else tenths(self.wanted)
         gone = not self.available and self.status is None
+        habits = self._habits
+        # Then it takes 6 A as long as it is not confirmed that it has stopped.
+        goes_on = habits is None or not habits.zero_stops
         if not may_draw or (demand >= LOWEST and not self.withheld):
             self._stopping_since = inf
         else:
             # It is about to stop, so no other box is stopped on its account, unless
             # it does not obey.
             self._stopping_since = min(self._stopping_since, now)
-            disobeys = gone or now - self._stopping_since > STOPS_WITHIN
+            disobeys = gone or now - self._stopping_since > (
+                OPENS_WITHIN if habits is None else habits.opens_within
+            )
             return Claim(unit=self.unit, demand=0, fixed=disobeys)
         if may_draw and gone:
-            return Claim(unit=self.unit, demand=min(demand, LOWEST), fixed=True)
+            # Perhaps it still receives the broadcasts. A 0 would stop it, so it comes
+            # after those that are there.
+            return Claim(
+                unit=self.unit, demand=min(demand, LOWEST), since=inf, fixed=goes_on
+            )
         return Claim(unit=self.unit, demand=demand, since=self._charging_since)
 
     @override
@@ -232,11 +295,15 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
                 self.read_soon(now)
         elif (
             share >= LOWEST
-            and now >= self._withheld_at + WITHHELD_FOR
+            and now >= self._withheld_at + self._withheld_for
             and not self.master.draw(self.unit).may_draw
         ):
             self._withheld_at = None
             self.read_soon(now)
+
+    @property
+    def _withheld_for(self) -> float:
+        return WITHHELD_POLLED if self._is_polled else WITHHELD_FOR
 
     @override
     def read_soon(self, now: float) -> None:
@@ -251,29 +318,36 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
         return partial(self.master.unless_silent, request)
 
     @override
+    async def write(self, turn: Turn, request: Request, register: int) -> bool | None:
+        allowed = partial(self.master.unless_forbidden, request)
+        return await super().write(turn, allowed, register)
+
+    @override
     def on_line_open(self) -> None:
         super().on_line_open()
-        self._answering.clear()
+        self._requests.reset()
+        self._cable = None
 
     @override
     async def poll(self, turn: Turn) -> FollowUp | None:
-        if self.has_other_dialect and turn.now < self._read_dialect_at:
-            raise self._refusal()
-        return await super().poll(turn)
+        follow_up = await super().poll(turn)
+        answer = self._polled.after_poll(self.master) if self._is_polled else None
+        return answer or follow_up
 
     @override
     async def _identify(self, turn: Turn) -> None:
         await super()._identify(turn)
-        self.has_other_dialect = self.dialect is not Dialect.V2_17
-        if self.has_other_dialect:
-            self._read_dialect_at = turn.now + OTHER_DIALECT_INTERVAL
-            self.set_unavailable(_OTHER_HANDSHAKE)
-            self.notice(Fault.UNSUPPORTED_FIRMWARE, present=True)
-            raise self._refusal()
+        self.expected_dialect = self.dialect
+        self.master.on_dialect()
 
-    def _refusal(self) -> NotAvailableError:
-        message = f"{self.config.name}: {_OTHER_HANDSHAKE}"
-        return NotAvailableError(message, "smartevse_other_firmware")
+    @override
+    def status_registers(self, dialect: Dialect, now: float) -> Registers[Status]:
+        longer, polled = MAPS[dialect].status, MAPS[dialect].balancing.status
+        has_more = longer.words.keys() > polled.words.keys()
+        if has_more and (self.status is None or now >= self._long_status_due):
+            self._long_status_due = now + LONG_STATUS_INTERVAL
+            return longer
+        return polled
 
     @override
     def on_status(self, status: Status, now: float) -> None:
@@ -281,32 +355,36 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
         if self.configuration is None:
             # Without it the limit is 6 A: a box that charges must not wait for it.
             self.read_soon(now)
-        closed = status.raw_state in CHARGING
+        charges = status.raw_state in CHARGING
+        closed = status.raw_state not in _OPEN if self._is_polled else charges
         if status.raw_state == UNPLUGGED:
             # The next car may come with another cable.
-            self._own_maximum = None
+            self._requests.own_maximum = None
+        self._cable = None if status.raw_state == UNPLUGGED else status.maximum
         if not closed:
             if now >= self._reserved_until:
                 self._charging_since = inf
         elif self._charging_since == inf:
             # Begun before our start, or under another master.
             self._charging_since = now
+        self._polled.on_status(status, now)
         self.master.on_status(
             self.unit,
             round(status.current * 10),
             closed=closed,
+            ending=status.raw_state == STOPPING,
             complete=self.configuration is not None,
         )
-        self._check_share(status, closed=closed)
+        self._check_share(status, charges=charges)
         if status.access and self.may_begin:
             # Access is on already: nothing is left to restore.
             self._paused_by_us = False
 
-    def _check_share(self, status: Status, *, closed: bool) -> None:
+    def _check_share(self, status: Status, *, charges: bool) -> None:
         """Reassert a share that is exceeded; a second time in a row is a fault."""
         share = round(self.share * 10)
         # Without a share it is to be stopped, whatever it offers.
-        if not closed or LOWEST <= share >= round(status.current * 10):
+        if not charges or LOWEST <= share >= round(status.current * 10):
             self._over_share = 0
             self.notice(Fault.LIMIT_NOT_TAKEN, present=False)
             return
@@ -319,7 +397,17 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
     @override
     def on_missed(self, now: float, why: str) -> None:
         super().on_missed(now, why)
+        if self._is_polled:
+            # No second attempt within a round, and one such box in each.
+            ready = max(self.slot.ready, self.master.next_probe(now))
+            self.slot.ready = self.slot.due = ready
         self.master.on_missed(self.unit)
+
+    @override
+    async def write_state(self, turn: Turn, request: Request) -> None:
+        accept = answer_to_state(self.unit, self.known_dialect)
+        with suppress(ReplyTimeoutError):
+            await turn.exchange(partial(self.master.unless_forbidden, request), accept)
 
     # -- Access --------------------------------------------------------------------
 
@@ -339,11 +427,17 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
 
         On only where we have turned it off for lack of current.
         """
-        if self.status is None:
+        if self.status is None or not self._has_volatile_access:
             return None
         if not is_stopped(self.known_dialect, self.status):
             return False if self._must_be_off() else None
         return True if self._paused_by_us and self.may_begin else None
+
+    @property
+    def _has_volatile_access(self) -> bool:
+        """Return whether its access may be written for a pause."""
+        habits = self._habits
+        return habits is not None and habits.access_is_volatile
 
     async def _switch_access(self, turn: Turn, allowed: bool) -> None:  # noqa: FBT001
         """Set the access bit, and remember whether to restore it."""
@@ -367,11 +461,14 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
     def _must_be_off(self) -> bool:
         # Access turned off at the box counts, too: an answer of ours that crossed it
         # on the line has closed the contactor all the same.
-        return not self.may_begin or self._has_no_access
+        if self.has_no_access:
+            return True
+        # A polled box without a share is stopped by a 0, and refused.
+        return self._is_paused if self._is_polled else not self.may_begin
 
     @property
-    def _has_no_access(self) -> bool:
-        """Return whether its access was off in the last status."""
+    @override
+    def has_no_access(self) -> bool:
         return self.status is not None and self.status.access is False
 
     # -- Orders --------------------------------------------------------------------
@@ -385,6 +482,9 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
                 if change.allowed is False:
                     # Paused by the user: no longer for lack of current.
                     self._withheld_at = None
+                if self.wanted.paused and not self._has_volatile_access:
+                    await self._stop_by_broadcast(turn)
+                    return
                 if self.wanted.paused:
                     await self._switch_access(turn, allowed=False)
                     if change.allowed is True and self._standing.allowed is not False:
@@ -392,7 +492,9 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
                         self._paused_by_us = True
                     return
                 starts = change.allowed is True or self._paused_by_us
-                if starts and not self.withheld:
+                if not self._has_volatile_access:
+                    self._check_access(change)
+                elif starts and not self.withheld:
                     await self._switch_access(turn, allowed=True)
                     await rest()
                 await self._follow(turn)
@@ -400,6 +502,30 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
             self._confirming = None
             with suppress(NotAvailableError):
                 self.master.update_shares()
+
+    def _check_access(self, change: OrderChange) -> None:
+        """Raise NotAvailableError for a start where access is kept, and off."""
+        if change.allowed is True and self.has_no_access:
+            message = f"{self.config.name}: its access is off in its own memory"
+            raise NotAvailableError(message, "smartevse_access_stored_off")
+
+    async def _stop_by_broadcast(self, turn: Turn) -> None:
+        """Broadcast 0 until it is read back that no current flows.
+
+        Raises NotConfirmedError.
+        """
+        habits = MAPS[self.known_dialect].balancing
+        until = turn.now + habits.opens_within
+        while True:
+            await self.master.send_broadcast(turn)
+            await rest()
+            await self.read_status(turn)
+            if not self.master.draw(self.unit).may_draw:
+                return
+            if turn.now > until:
+                message = f"{self.config.name} does not stop"
+                raise NotConfirmedError(message)
+            await rest(READ_AGAIN)
 
     async def _follow(self, turn: Turn) -> None:
         """Broadcast until a current within its orders is read back.
@@ -419,12 +545,34 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
         message = f"{self.config.name} does not follow its limit"
         raise NotConfirmedError(message)
 
+    async def store_access(self, allowed: bool) -> None:  # noqa: FBT001
+        """Turn its access on or off in its own memory; return when it is read back.
+
+        Such a memory wears out: this is for people, not for pauses. Raises
+        NotAvailableError where access is not kept, NotConfirmedError, and what `run`
+        raises.
+        """
+        if self._habits is None or self._has_volatile_access:
+            message = f"{self.config.name} does not keep its access"
+            raise NotAvailableError(message)
+        await self.run(partial(self.set_access, allowed=allowed))
+
     @override
     async def on_shutdown(self, *, removed: bool = False) -> None:
-        if removed:
-            # It would follow the broadcasts to the others, and not be counted.
+        habits = self._habits
+        if habits is None or habits.access_is_volatile:
+            if removed:
+                # It would follow the broadcasts to the others, and not be counted.
+                await self.run(
+                    partial(self.set_access, allowed=False),
+                    persistence=Persistence.STANDING,
+                    kind=Kind.PAUSE,
+                )
+        elif removed or not habits.fail_safe_proven:
+            # Likewise, or without broadcasts it might go on for ever.
+            self._is_leaving = True
             await self.run(
-                partial(self.set_access, allowed=False),
+                self._stop_by_broadcast,
                 persistence=Persistence.STANDING,
                 kind=Kind.PAUSE,
             )
@@ -438,97 +586,4 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Slave):
         request = decode_request(frame)
         if request is None or request.unit != self.unit or self.bus is None:
             return None
-        now = self.master.now
-        if self.dialect is not Dialect.V2_17:
-            # A box that was not read is not answered.
-            self.read_soon(now)
-            return FollowUp(nothing)
-        reads_first = False
-        if request.kind in _FOR_CURRENT:
-            self._own_maximum = request.wanted
-            # Its access was turned on since its last status, or off after the request.
-            reads_first = self.may_begin and self._has_no_access
-        else:
-            # The others need not wait for what it leaves.
-            self._reserved_until = -inf
-            self.read_soon(now)
-        if now < self._answering.get(request.kind, -inf):
-            return FollowUp(nothing)
-        answer_by = now + ANSWER_WITHIN
-        self._answering[request.kind] = answer_by
-        if reads_first:
-            return FollowUp(partial(self._read_and_answer, request, answer_by))
-        return FollowUp(
-            partial(self._answer, request, answer_by), worst_case=self._answer_time
-        )
-
-    async def _read_and_answer(
-        self, request: SlaveRequest, answer_by: float, turn: Turn
-    ) -> None:
-        """Answer a request if the box has access: a conversation."""
-        try:
-            await self.read_status_once(turn)
-        finally:
-            if self._has_no_access or self.status is None:
-                # It asks again in a second.
-                self._answering.pop(request.kind, None)
-        if not self._has_no_access:
-            await rest(worst_case=self._answer_time)
-            await self._answer(request, answer_by, turn)
-
-    async def _answer(
-        self, request: SlaveRequest, answer_by: float, turn: Turn
-    ) -> None:
-        """Answer a request, once the others have made room for it: a conversation."""
-        rounds = ROUNDS
-        while turn.now <= answer_by:
-            others: list[Slave] = []
-            if rounds and self._needs_room(request, answer_by):
-                others = self.master.above_share(self.unit)
-                rounds -= 1
-            try:
-                if not others:
-                    await turn.send(partial(self._answer_frame, request))
-                    self._answering.pop(request.kind, None)
-                    self.master.update_shares()
-                    return
-                await self.master.lower(turn, others)
-            except LineBusyError:
-                pass
-            await rest(worst_case=self._answer_time)
-        self._answering.pop(request.kind, None)
-
-    @property
-    def _answer_time(self) -> float | None:
-        """Return the longest time it takes to send an answer, s."""
-        return self.bus.wire.send_time(_ANSWER_BYTES) if self.bus is not None else None
-
-    def _needs_room(self, request: SlaveRequest, answer_by: float) -> bool:
-        """Return whether others must go down first; reserves its share meanwhile."""
-        if request.kind not in _FOR_CURRENT or not self.may_begin:
-            return False
-        self._reserved_until = answer_by
-        return not self.master.grant(self.unit) and bool(
-            self.master.shares().get(self.unit)
-        )
-
-    def _answer_frame(self, request: SlaveRequest) -> bytes:
-        """Return the answer of this moment, which must be sent now.
-
-        Raises NotAvailableError beside another master.
-        """
-        return self.master.unless_silent(partial(self._granted, request))
-
-    def _granted(self, request: SlaveRequest) -> bytes:
-        if request.kind not in _FOR_CURRENT or not self.may_begin:
-            return acknowledge(request, None)
-        now = self.master.now
-        setpoint = self.setpoint_within(self.master.grant(self.unit) / 10)
-        if setpoint.paused:
-            self._reserved_until = -inf
-            return acknowledge(request, None)
-        if request.kind is RequestKind.C:
-            self.master.draw(self.unit).granted(tenths(setpoint), now)
-        self._charging_since = min(self._charging_since, now)
-        self._reserved_until = now + RESERVED_FOR
-        return acknowledge(request, setpoint)
+        return self._requests.on_request(request, self.master)
