@@ -28,6 +28,7 @@ TIMED = (
     "abl/reader.py",
     "abl/writer.py",
     "bus.py",
+    "ceiling.py",
     "evbox/config.py",
     "ews/network/admission.py",
     "ews/network/line.py",

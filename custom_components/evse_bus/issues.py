@@ -301,7 +301,7 @@ class BusIssues:
         # Until the charger reports its interval, the one in use is an assumption.
         if interval is None:
             return
-        ordered = charger.effective_orders.fail_safe_timeout
+        ordered = charger.valid_orders.fail_safe_timeout
         used = charger.setpoint.fail_safe_timeout
         if ordered >= INTERVALS_PER_TIMEOUT * interval or used <= ordered:
             self._set(TIMEOUT_RAISED, managed.key, present=False)

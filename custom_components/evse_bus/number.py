@@ -282,7 +282,7 @@ class OrderNumber(ChargerEntity, NumberEntity):
         """Show the order in effect, and its range."""
         order = self._order
         limits = self.charger.limits
-        self._attr_native_value = order.value(self.charger.effective_orders, limits)
+        self._attr_native_value = order.value(self.charger.valid_orders, limits)
         self._attr_native_min_value = order.lowest
         self._attr_native_max_value = order.highest(limits)
         self._attr_native_step = order.finest(limits)

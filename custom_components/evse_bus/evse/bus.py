@@ -200,25 +200,39 @@ class Bus(Observable):
         Raises what its conversation raises, SupersededError when a newer one
         took its place, LineLostError when the port is gone.
         """
-        if self._stopping or self._task is None:
-            message = f"{self.name} is stopped"
-            raise NotAvailableError(message)
-        if not self.connected:
-            message = f"{self.name} is not connected"
-            raise LineLostError(message)
-        if self.master is not None and (refusal := self.master.refusal) is not None:
+        if (refusal := self._refusal) is not None:
             raise refusal
         if (waiting := self._jobs.merge(job)) is not None:
             self.wire.statistics.merged += 1
             job = waiting
         else:
-            self._jobs.add(job)
-            self._respect_minimum(self._charger_of(job))
+            self._enqueue(job)
         self.reschedule()
         # The caller may give up; the command itself is still carried out. (A shield
         # would log a failure that no caller is left to handle.)
         await asyncio.wait({job.future})
         return job.future.result()
+
+    def queue(self, job: Job) -> bool:
+        """Queue a command that has no caller; return whether it can be sent now."""
+        if self._refusal is not None:
+            return False
+        self._enqueue(job)
+        self.reschedule()
+        return True
+
+    def _enqueue(self, job: Job) -> None:
+        self._jobs.add(job)
+        self._respect_minimum(self._charger_of(job))
+
+    @property
+    def _refusal(self) -> EvseError | None:
+        """Return why no command can be sent now."""
+        if self._stopping or self._task is None:
+            return NotAvailableError(f"{self.name} is stopped")
+        if not self.connected:
+            return LineLostError(f"{self.name} is not connected")
+        return None if self.master is None else self.master.refusal
 
     async def run[T](
         self, conversation: Conversation[T], *, kind: Kind = Kind.PROBE
@@ -304,13 +318,14 @@ class Bus(Observable):
                     await self.port.renew()
                 if not self.line.is_open and not await self.port.reopen():
                     return
+                expires_at = self._expire_ceilings()
                 slots = self._slots()
                 if self._stopping and not slots:
                     return
                 choice = choose(slots, self.now, self._last)
                 slot = choice.slot
                 if slot is None:
-                    wake_at = min(choice.wake_at, self.port.renew_at)
+                    wake_at = min(choice.wake_at, self.port.renew_at, expires_at)
                     await self._timer.sleep_until(wake_at)
                     continue
                 self.wire.statistics.for_deadline += choice.for_deadline
@@ -343,6 +358,12 @@ class Bus(Observable):
             self._turn_over.set()
             self.wire.statistics.busy(started, self.now)
 
+    def _expire_ceilings(self) -> float:
+        """Lower the ceilings that were not renewed; return when the next one is due."""
+        now = self.now
+        chargers = self.chargers.values()
+        return min((one.expire_ceiling(now) for one in chargers), default=inf)
+
     def _slots(self) -> list[Slot]:
         if self._stopping:
             return [job for job in self._jobs if job.begun]
@@ -373,6 +394,8 @@ class Bus(Observable):
                 self._poll_ended(charger, slot.outcome, is_planned=True)
         elif charger is not None:
             await self._poll_turn(charger)
+        if charger is not None:
+            await charger.keep_ceiling_pause()
         self._respect_minimum(charger)
 
     def _charger_of(self, slot: Slot) -> Charger | None:

@@ -7,7 +7,8 @@ for every protocol alike:
 - a lowering counts (and is stored) before it is sent, a raise only after the
   charger has confirmed it;
 - permission and limit are independent of each other;
-- an order that is not renewed within its lifetime becomes the fail-safe value.
+- an order that is not renewed within its lifetime becomes the fail-safe value;
+- a ceiling that the house sets lowers what counts of them (`ceiling`).
 
 A charger knows its bus as a `Scheduler`.
 """
@@ -22,8 +23,18 @@ import logging
 from math import inf
 from typing import ClassVar, Final, Protocol, override
 
+from .ceiling import (
+    GOVERNED,
+    PAUSED_BY_CEILING,
+    RETRY,
+    Ceiling,
+    CeilingPause,
+    Governance,
+    lowered,
+    released,
+)
 from .conversation import Conversation, FollowUp, nothing
-from .errors import NotAvailableError
+from .errors import NotAvailableError, RefusedOrderError
 from .events import EventListener, Events
 from .exchange import Turn, Wire
 from .framing import Frame, Timing
@@ -55,6 +66,7 @@ from .safety import (
     check_change,
     clamp,
     expired,
+    number,
     pause_reason,
 )
 from .schedule import Kind, Slot
@@ -85,6 +97,9 @@ class Scheduler(Protocol):
 
     async def submit(self, job: Job) -> object:
         """Queue a command and return its result (see `Bus.submit`)."""
+
+    def queue(self, job: Job) -> bool:
+        """Queue a command without a caller (see `Bus.queue`)."""
 
     def supersede(self, charger: Charger, which: Callable[[OrderChange], bool]) -> None:
         """Drop waiting order changes that a newer command makes wrong."""
@@ -149,8 +164,12 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         self.bus: Scheduler | None = None
         self._renewals = Renewals()
         """That of the line, once it is on a bus."""
+        self.governance = Governance(orders)
+        self._ceiling_job: Job | None = None
         self._clamped: tuple[tuple[Orders, Limits], Setpoint] | None = None
-        self._reason: tuple[tuple[Orders, Limits], PauseReason | None] | None = None
+        self._reason: (
+            tuple[tuple[Orders, Orders, Limits], PauseReason | None] | None
+        ) = None
 
     # -- Configuration and state -------------------------------------------------
 
@@ -182,9 +201,20 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         return {"serial": serial}
 
     @property
-    def effective_orders(self) -> Orders:
-        """Return the orders that count now, lifetime considered."""
+    def valid_orders(self) -> Orders:
+        """Return the orders that stand, their lifetime considered."""
         return expired(self.orders) if self.orders_expired else self.orders
+
+    @property
+    def effective_orders(self) -> Orders:
+        """Return the orders that count now: the valid ones under the ceiling."""
+        return self._under_ceiling(self.valid_orders)
+
+    def _under_ceiling(self, orders: Orders) -> Orders:
+        if self.governance.ceiling is None:
+            return orders
+        now = asyncio.get_running_loop().time()
+        return lowered(orders, self.governance.amperes(now, self.limits.minimum))
 
     @property
     def setpoint(self) -> Setpoint:
@@ -212,13 +242,16 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         allowed = self.reading.allowed if self.reading is not None else None
         if allowed is False and not self.waits_for_current:
             # Behind a disabled outlet nothing is allowed, whatever was ordered.
-            disabled = self.hindrance is PauseReason.OUTLET_DISABLED
-            if disabled and self.effective_orders.allowed is not False:
+            if self.orders.allowed is False:
+                return PauseReason.NOT_ALLOWED
+            if self.hindrance is PauseReason.OUTLET_DISABLED:
                 return PauseReason.OUTLET_DISABLED
+            if self.governance.unproved is not None:
+                return PauseReason.WAITS_FOR_USER
             return PauseReason.NOT_ALLOWED
-        inputs = (self.effective_orders, self.limits)
+        inputs = (self.valid_orders, self.effective_orders, self.limits)
         if self._reason is None or self._reason[0] != inputs:
-            self._reason = (inputs, pause_reason(*inputs))
+            self._reason = (inputs, _reason_of(*inputs))
         return self._reason[1] or self.hindrance
 
     @property
@@ -265,6 +298,7 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
             self.waits_for_current,
             self.pause_reason,
             self.order_state,
+            None if self.governance.ceiling is None else self.setpoint,
         )
 
     @property
@@ -295,6 +329,14 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         Raises NotConfirmedError when the charger does not follow, and what
         `Turn.exchange` raises.
         """
+
+    async def follow_ceiling(self, turn: Turn) -> None:
+        """Make the charger follow the ceiling that counts now; return when sure.
+
+        A conversation; raises as `apply`. A ceiling below the minimum pauses it; a
+        higher one ends no pause but one of ours (see `ceiling`).
+        """
+        await self.apply(turn, self.effective_orders, OrderChange())
 
     @property
     @abstractmethod
@@ -469,6 +511,8 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         if checked.is_about_now:
             self._renewals.at[self.config.key] = loop.time()
             self.orders_expired = False
+        if checked.allowed is not None:
+            self.governance.allowed_or_stopped()
         self._requested = checked.apply(self._requested)
         lowered = cautious(self.orders, checked.apply(self.orders))
         if lowered != self.orders:
@@ -535,7 +579,7 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         A change of the fail-safe alone renews nothing.
         """
         target = self.confirmed_target(change)
-        return expired(target) if self.orders_expired else target
+        return self._under_ceiling(expired(target) if self.orders_expired else target)
 
     def expire_orders(self, now: float) -> bool:
         """Expire orders whose lifetime is over; return whether they just expired."""
@@ -555,6 +599,194 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         )
         self.updated()
         return True
+
+    # -- The ceiling ---------------------------------------------------------------
+
+    @property
+    def ceiling(self) -> Ceiling | None:
+        """Return the ceiling set last; ``None``: it is not governed."""
+        return self.governance.ceiling
+
+    async def govern(self, safe: float) -> None:
+        """Put it under a ceiling from now on, also after a restart.
+
+        Until one is set (`set_ceiling`), and whenever none is any more, it gets no more
+        than the safe value, A. Raises RefusedOrderError for an unusable number.
+        """
+        checked = number(safe, "safe value")
+        governance, before = self.governance, self._permitted
+        now = asyncio.get_running_loop().time()
+        if governance.ceiling is None:
+            governance.ceiling = Ceiling.first(checked, paused=False)
+        else:
+            governance.ceiling = governance.ceiling.with_safe(checked, now)
+        self._on_ceiling(before)
+        await self.remember(GOVERNED, f"{checked:g}")
+
+    def set_ceiling(self, amperes: float, *, guard: float | None = None) -> None:
+        """Set the ceiling, A, or renew it; it is sent like a limit.
+
+        Does not wait: one charger that is slow or silent must not hold up the others of
+        the house. `setpoint` follows at once, the reading when the charger does.
+        ``guard``: what the main fuse permits, where the ceiling is lower for another
+        reason. Raises RefusedOrderError for an unusable number, or while the charger is
+        not governed.
+        """
+        governance, before = self.governance, self._permitted
+        if governance.ceiling is None:
+            message = f"{self.config.name} is not governed"
+            raise RefusedOrderError(message)
+        now = asyncio.get_running_loop().time()
+        governance.ceiling = governance.ceiling.renew(amperes, guard, now)
+        governance.expired = False
+        self._on_ceiling(before)
+
+    def give_up_ceiling(self) -> None:
+        """Let the ceiling expire now: the house is reloaded, disabled or has failed."""
+        governance, before = self.governance, self._permitted
+        if governance.ceiling is not None:
+            now = asyncio.get_running_loop().time()
+            governance.ceiling = governance.ceiling.give_up(now)
+            governance.expired = True
+            self._on_ceiling(before)
+
+    async def release(self) -> None:
+        """End that it is governed: the house is removed.
+
+        Its orders are lowered to the safe value, and stored; where a ceiling pauses it,
+        it stays stopped. Raising them is the user's word.
+        """
+        governance = self.governance
+        if governance.ceiling is None:
+            return
+        now = asyncio.get_running_loop().time()
+        least = self.limits.minimum
+        stop = governance.amperes(now, least) < least or governance.unproved is not None
+        safe = governance.ceiling.safe
+        self._requested = released(self._requested, safe, stop=stop)
+        self.orders = released(self.orders, safe, stop=stop)
+        notes = dict(self.orders.remembered)
+        for name in (GOVERNED, PAUSED_BY_CEILING):
+            notes.pop(name, None)
+        self.orders = replace(self.orders, remembered=notes)
+        await self._store(self.orders)
+        governance.ceiling = governance.unproved = None
+        governance.allowed_or_stopped()
+        self._send_ceiling(lowers=True)
+        self.updated()
+
+    def expire_ceiling(self, now: float) -> float:
+        """Lower a ceiling that was not renewed; return when it will have to be."""
+        governance = self.governance
+        if governance.ceiling is None or governance.expired:
+            return inf
+        if now < governance.ceiling.expires_at:
+            return governance.ceiling.expires_at
+        governance.expired = True
+        _LOGGER.warning(
+            "%s: the house has set no ceiling in time; no more than %g A until it does",
+            self.config.name,
+            governance.ceiling.amperes(now),
+        )
+        governance.pending = True
+        self._send_ceiling(lowers=True)
+        self.updated()
+        return inf
+
+    @property
+    def _permitted(self) -> Setpoint:
+        """Return the set-point of orders and ceiling, without any share of it."""
+        return clamp(self.effective_orders, self.limits)
+
+    def _on_ceiling(self, before: Setpoint) -> None:
+        """Send a ceiling that changes what counts, or that was not followed yet."""
+        governance, wanted = self.governance, self._permitted
+        changed = wanted.currents != before.currents
+        lowers = all(
+            new <= old
+            for new, old in zip(wanted.currents, before.currents, strict=True)
+        )
+        now = asyncio.get_running_loop().time()
+        if changed or (governance.pending and now >= governance.retry_at):
+            governance.pending = True
+            self._send_ceiling(lowers=lowers)
+        if changed:
+            self.updated()
+
+    def _send_ceiling(self, *, lowers: bool) -> None:
+        """Have the ceiling that counts sent; several that wait are one command."""
+        if self.bus is None:
+            return
+        kind = Kind.PAUSE if self._permitted.paused else Kind.COMMAND
+        waiting = self._ceiling_job
+        if waiting is not None and waiting.waits:
+            waiting.kind = kind
+            waiting.raises = not lowers
+            self.bus.reschedule()
+            return
+        job = Job(
+            owner=self,
+            kind=kind,
+            due=asyncio.get_running_loop().time(),
+            worst_case=self.bus.worst_case(self),
+            meets=self.slot if self.orders_keep_alive else None,
+            conversation=self._follow_ceiling,
+            persistence=Persistence.STANDING,
+            change=OrderChange(),
+            raises=not lowers,
+        )
+        if self.bus.queue(job):
+            self._ceiling_job = job
+
+    async def _follow_ceiling(self, turn: Turn) -> None:
+        governance = self.governance
+        governance.retry_at = turn.now + RETRY
+        wanted = self._permitted
+        await self.follow_ceiling(turn)
+        if self._permitted == wanted:
+            governance.pending = False
+        self.updated()
+
+    # -- Its pause -----------------------------------------------------------------
+
+    @property
+    def holds_ceiling_pause(self) -> bool:
+        """Return whether it is paused by us for lack of current."""
+        return self.waits_for_current
+
+    @property
+    def visit(self) -> str | None:
+        """Return what proves, after a restart, that the same car is still there."""
+        return None
+
+    @property
+    def serial_read(self) -> str | None:
+        """Return the serial number that was read from the box."""
+        return self.info.serial if self.info is not None else None
+
+    async def keep_ceiling_pause(self) -> None:
+        """Note with its orders that a ceiling has paused it, or no more."""
+        governance = self.governance
+        if governance.ceiling is None or not self.available or self.reading is None:
+            return
+        if governance.unproved is not None:
+            if self.reading.allowed is False and not self.holds_ceiling_pause:
+                return
+            # There is no pause any more, or it has been proved to be ours.
+            governance.unproved = None
+        noted = self.orders.remembered.get(PAUSED_BY_CEILING)
+        note = None
+        if self.holds_ceiling_pause:
+            note = noted
+            if self.is_paused_by_ceiling and note is None:
+                note = CeilingPause(self.serial_read, self.visit).note
+        await self.remember(PAUSED_BY_CEILING, note)
+
+    @property
+    def is_paused_by_ceiling(self) -> bool:
+        """Return whether the ceiling alone allows no current."""
+        valid = clamp(self.valid_orders, self.limits)
+        return not valid.paused and self._permitted.paused
 
     # -- Commands ----------------------------------------------------------------
 
@@ -671,6 +903,13 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
             now, ordered=self.setpoint.paused, shown=shown, patience=patience
         )
         self.notice(Fault.CHARGES_ALTHOUGH_PAUSED, present=against)
+
+
+def _reason_of(valid: Orders, effective: Orders, limits: Limits) -> PauseReason | None:
+    """Return why orders let no car charge, by themselves or under the ceiling."""
+    if (reason := pause_reason(valid, limits)) is not None:
+        return reason
+    return PauseReason.CEILING_TOO_LOW if pause_reason(effective, limits) else None
 
 
 def _accept(_serial: str) -> bool:

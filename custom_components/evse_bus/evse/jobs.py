@@ -61,6 +61,11 @@ class Job(Slot):
     )
 
     @property
+    def waits(self) -> bool:
+        """Return whether it waits for its first turn."""
+        return not (self.begun or self.under_way or self.future.done())
+
+    @property
     def outcome(self) -> object:
         """Return the result of its conversation, or its error, once it has ended."""
         future = self.future
@@ -99,7 +104,7 @@ class JobQueue:
 
     def add(self, job: Job) -> None:
         """Add a job."""
-        job.raises = _raises(job)
+        job.raises |= _raises(job)
         self._jobs.append(job)
 
     def merge(self, job: Job) -> Job | None:
@@ -113,7 +118,7 @@ class JobQueue:
         for waiting in reversed(self._jobs):
             if (waiting.owner, waiting.merge_key) != (job.owner, job.merge_key):
                 continue
-            if waiting.change is None or waiting.begun or waiting.under_way:
+            if waiting.change is None or not waiting.waits:
                 # Nor into an older one: this one's end would undo it.
                 return None
             waiting.change = waiting.change.merged_with(job.change)
@@ -127,7 +132,7 @@ class JobQueue:
             if (
                 job.owner is owner
                 and job.change is not None
-                and not (job.begun or job.under_way)
+                and job.waits
                 and which(job.change)
             ):
                 self.fail(job, SupersededError("a newer command came first"))

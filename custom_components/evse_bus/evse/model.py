@@ -115,6 +115,11 @@ class PauseReason(StrEnum):
     """Installation, charger or cable carry less than the charger's minimum."""
     SUPPLY_TOO_LOW = "supply_too_low"
     """Its part of the shared supply is below the minimum."""
+    CEILING_TOO_LOW = "ceiling_too_low"
+    """The house permits less than the minimum: its sun, or its main fuse."""
+    WAITS_FOR_USER = "waits_for_user"
+    """Paused by a ceiling before a restart, and the same car is not proved to be there:
+    the user allows it again."""
     LIMIT_NOT_FOLLOWED = "limit_not_followed"
     """It was stopped because it offered more than its limit."""
     CHARGE_ENDED = "charge_ended"

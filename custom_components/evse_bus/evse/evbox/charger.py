@@ -292,7 +292,20 @@ class EvboxCharger(Charger[EvboxConfig]):
         self._outdated = setpoint != self._setpoint(orders())
 
     def _setpoint(self, orders: Orders) -> Setpoint:
-        return setpoint_for(orders, self.limits, self._plausibility.interval.value)
+        interval = self._plausibility.interval.value
+        wanted = setpoint_for(orders, self.limits, interval)
+        governed = self.governance.fail_safe(orders, paused=wanted.paused)
+        if governed is orders:
+            return wanted
+        # A car that is paused must not start when Home Assistant dies.
+        return setpoint_for(governed, self.limits, interval)
+
+    @property
+    @override
+    def holds_ceiling_pause(self) -> bool:
+        # Its pause is in our set-point alone: nobody else can pause it.
+        confirmed = self._confirmed
+        return confirmed is not None and confirmed.paused and self._permitted.paused
 
     def _match_reply(self, frame: EvboxFrame) -> Reply | None:
         """Return the reply to our request; ``None``: the frame is another."""
