@@ -12,6 +12,7 @@ import pytest
 
 INTEGRATION = Path(__file__).parents[1] / "custom_components/evse_bus"
 EVSE = INTEGRATION / "evse"
+HOUSE = INTEGRATION / "house"
 VIRTUAL = Path(__file__).parent / "virtual"
 PROTOCOLS = sorted(path.parent.name for path in EVSE.glob("*/charger.py"))
 
@@ -137,6 +138,17 @@ def outside(path: Path, root: Path) -> set[str]:
 def test_the_library_stands_alone(path: Path) -> None:
     allowed = LIBRARY_MAY | set(sys.stdlib_module_names)
     assert outside(path, EVSE) <= allowed
+
+
+@pytest.mark.parametrize("path", sorted(HOUSE.rglob("*.py")), ids=lambda p: p.name)
+def test_sun_and_fuse_are_arithmetic(path: Path) -> None:
+    """No library, no clock, no loop, no chance; nothing of `evse/` or beside it."""
+    used = outside(path, INTEGRATION)
+    assert used <= set(sys.stdlib_module_names)
+    assert not used & {"asyncio", "time", "datetime", "random", "threading"}
+    ours = {name for name in graph(INTEGRATION) if name.split(".")[0] == "house"}
+    name = ".".join(path.relative_to(INTEGRATION).with_suffix("").parts)
+    assert graph(INTEGRATION)[name.removesuffix(".__init__")] <= ours
 
 
 @pytest.mark.parametrize("name", ["model", "errors"])

@@ -1,0 +1,1 @@
+"""Sun and main fuse: the pure library."""
