@@ -18,7 +18,7 @@ from .watched import Scene
 from .watched_abl import AblScene
 from .watched_evbox import EvboxScene
 from .watched_ews import EwsScene
-from .watched_smartevse import PolledScene, SlaveScene
+from .watched_smartevse import NODES, PolledScene, SlaveScene
 
 NAME = "adapter-away"
 AWAY: Final = (0.1, 600.0)
@@ -73,6 +73,7 @@ CASES: Final = {
     "smartevse 2.17": partial(PolledScene, dialect="2.17"),
     "smartevse 2.30": partial(PolledScene, dialect="2.30"),
     "smartevse slaves": SlaveScene,
+    "smartevse nodes": partial(SlaveScene, dialects=NODES),
     "ews": EwsScene,
 }
 

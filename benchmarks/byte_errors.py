@@ -8,7 +8,6 @@ from functools import partial
 from random import Random
 from typing import Final
 
-from custom_components.evse_bus.evse.charger import Charger
 from custom_components.evse_bus.evse.errors import EvseError
 from custom_components.evse_bus.evse.model import OrderChange
 from tests.virtual.faults import DAMAGES
@@ -38,7 +37,8 @@ METHOD = f"""\
 In simulated time, 24 h for each line of the table: library and virtual chargers on one
 loop, the wire at its pace. Each byte on the wire, in both directions, is damaged with a
 probability of {RATE:g}: one bit flips, another byte is in its place, it is lost, or a
-byte comes before it. Cars come and go, the orders change every {BETWEEN_ORDERS[0]:g} to
+byte comes before it; but not on the connection of a box that dials, since TCP checks
+them. Cars come and go, the orders change every {BETWEEN_ORDERS[0]:g} to
 {BETWEEN_ORDERS[1]:g} s, the port is away for {LOSSES[0]:g} to {LOSSES[1]:g} s every 1 to 3 h.
 Wrong is a published value that the box had at no time in the 6 s before, one still
 shown after 30 s (a value that is asked for less often: so much later), a total beyond
@@ -85,6 +85,9 @@ CASES: Final = {
     "smartevse 2.20": partial(PolledScene, dialect="2.20"),
     "smartevse 2.30": partial(PolledScene, dialect="2.30"),
     "smartevse slaves": SlaveScene,
+    "smartevse 2.20 nodes": partial(SlaveScene, dialects=("2.20",) * 3),
+    "smartevse 2.30 nodes": partial(SlaveScene, dialects=("2.30", "2.30+", "2.30+")),
+    "smartevse 3.x nodes": partial(SlaveScene, dialects=("3", "3.8", "3.6")),
     "ews rs-232": EwsScene,
     "ews network": EwsNetworkScene,
 }
@@ -110,10 +113,11 @@ async def watch(case: Case) -> Outcome:
     dice = Random(case.seed)  # noqa: S311 - repeatable on purpose
     outcome = Outcome()
     async with case.make(case.seed) as scene:
-        scene.virtual.faults.damage = DAMAGES
-        scene.virtual.faults.byte_error_rate = case.rate
+        if not scene.checks_bytes:
+            scene.virtual.faults.damage = DAMAGES
+            scene.virtual.faults.byte_error_rate = case.rate
         tasks = [
-            asyncio.create_task(_order(scene.chargers, dice, outcome)),
+            asyncio.create_task(_order(scene, dice, outcome)),
             asyncio.create_task(_lose(scene, dice)),
         ]
         await asyncio.sleep(case.seconds)
@@ -133,12 +137,12 @@ async def watch(case: Case) -> Outcome:
     return outcome
 
 
-async def _order(chargers: list[Charger], dice: Random, outcome: Outcome) -> None:
+async def _order(scene: Scene, dice: Random, outcome: Outcome) -> None:
     """Change orders now and then."""
     loop = asyncio.get_running_loop()
     while True:
         await asyncio.sleep(dice.uniform(*BETWEEN_ORDERS))
-        charger = dice.choice(chargers)
+        charger = dice.choice(scene.chargers)
         if charger.orders.allowed is False:
             change = OrderChange(allowed=True)
         elif dice.random() < FORBIDS:
@@ -147,7 +151,8 @@ async def _order(chargers: list[Charger], dice: Random, outcome: Outcome) -> Non
             change = OrderChange(current=dice.choice(CURRENTS))
         began = loop.time()
         try:
-            await charger.change_orders(change)
+            with scene.ordering(charger, change):
+                await charger.change_orders(change)
         except EvseError as error:
             outcome.failed[type(error).__name__] += 1
             outcome.notes.append(

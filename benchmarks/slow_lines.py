@@ -21,7 +21,7 @@ from .watched import Scene
 from .watched_abl import AblScene
 from .watched_evbox import EvboxScene
 from .watched_ews import EwsNetworkScene
-from .watched_smartevse import PolledScene, SlaveScene
+from .watched_smartevse import NODES, PolledScene, SlaveScene
 from .witness import Findings
 
 NAME = "slow-lines"
@@ -78,6 +78,7 @@ CASES: Final = {
     "smartevse 2.20": partial(PolledScene, dialect="2.20"),
     "smartevse 2.30": partial(PolledScene, dialect="2.30"),
     "smartevse slaves": SlaveScene,
+    "smartevse nodes": partial(SlaveScene, dialects=NODES),
     "ews network": EwsNetworkScene,
 }
 

@@ -62,9 +62,20 @@ read. Offered: the pilot of the box has the new current."""
 TWO_17: Final = MasterScene(
     "2.17 x3", ("2.17",) * 3, (32.0, 12.0, 16.0, 20.0, 25.0, 48.0)
 )
+SEVEN: Final = (80.0, 24.0, 32.0, 44.0, 50.0, 63.0, 112.0)
+"""Supplies for seven boxes; 42 A is the least for all of them."""
+TWO_20: Final = MasterScene("2.20 x7", ("2.20",) * 7, SEVEN)
+LATER: Final = MasterScene(
+    "2.30 to 3.x x7",
+    ("2.30", "2.30", "2.30+", "2.30+", "3", "3.8", "3.6"),
+    SEVEN,
+)
 SCENES: Final = (
     TWO_17,
     replace(TWO_17, name="2.17 x3, one dead", dead=True),
+    TWO_20,
+    LATER,
+    replace(LATER, name="2.30 to 3.x x7, one dead", dead=True),
 )
 MINUTES: Final = 10.0
 """Of each scene; one with a dead box takes a fifth of it."""

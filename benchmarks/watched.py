@@ -7,13 +7,19 @@ reading shows is left out.
 
 from abc import ABC, abstractmethod
 import asyncio
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from math import inf
 from typing import Any, ClassVar, Final, Self
 
 from custom_components.evse_bus.evse.bus import Bus
 from custom_components.evse_bus.evse.charger import Charger
-from custom_components.evse_bus.evse.model import CurrentLimit, Fault, Orders
+from custom_components.evse_bus.evse.model import (
+    CurrentLimit,
+    Fault,
+    OrderChange,
+    Orders,
+)
 from custom_components.evse_bus.evse.readings import ConnectorReading
 from tests.virtual import Car, CarLife, VirtualBus
 from tests.virtual.device import Device
@@ -64,6 +70,8 @@ class WatchedBox[D: Device](ABC):
         self.device = device
         self.charger = charger
         self.disturbed_until = -inf
+        self.asked = 0.0
+        """The current of an order that is under way, A."""
 
     @abstractmethod
     def truth(self) -> Values:
@@ -95,9 +103,10 @@ class WatchedBox[D: Device](ABC):
         return {}
 
     def ordered(self) -> float:
-        """Return the highest current that the orders allow, A."""
+        """Return the highest current that the orders allow, or one under way, A."""
         orders = self.charger.orders
-        return 0.0 if orders.allowed is False else max(orders.limit.effective())
+        stands = 0.0 if orders.allowed is False else max(orders.limit.effective())
+        return max(stands, self.asked)
 
     def shown(self) -> Values:
         """Return what the library shows."""
@@ -134,6 +143,8 @@ class Scene(ABC):
     """Time in which a lower limit must have arrived, s."""
     dials: bool = False
     """The box dials: its bus gets the line later."""
+    checks_bytes: bool = False
+    """Its line checks its bytes by itself: none of them arrives damaged."""
 
     def __init__(self) -> None:
         """Make the chargers in `make`."""
@@ -175,6 +186,17 @@ class Scene(ABC):
         until = asyncio.get_running_loop().time() + seconds
         for box in self.boxes:
             box.disturbed_until = until
+
+    @contextmanager
+    def ordering(self, charger: Charger, change: OrderChange) -> Iterator[None]:
+        """Let a box follow an order already while it is under way."""
+        box = next(one for one in self.boxes if one.charger is charger)
+        limit = max(charger.orders.limit.effective())
+        box.asked = change.current or (limit if change.allowed else 0.0)
+        try:
+            yield
+        finally:
+            box.asked = 0.0
 
     async def lose_port(self, seconds: float) -> None:
         """Unplug the adapter for a time, s."""

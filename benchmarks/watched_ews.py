@@ -215,6 +215,7 @@ class EwsNetworkScene(EwsScene):
     """The same box, which dials."""
 
     dials = True
+    checks_bytes = True
     listener: Listener
 
     @override

@@ -1,5 +1,6 @@
-"""SmartEVSE boxes, polled and as slaves, and what a witness compares of them."""
+"""SmartEVSE boxes, polled and with a master, and what a witness compares of them."""
 
+from collections.abc import Sequence
 from typing import ClassVar, Final, override
 
 from custom_components.evse_bus.evse.charger import Charger
@@ -27,9 +28,14 @@ ERRORS: Final = {
 }
 """By the manual's table of 0x00A1."""
 NO_COMM: Final = 2
+LETTERS: Final = "ABCDEFGH"
+"""States by their number, from 2.20 on; 2.17 reports the letter."""
+NAMED: Final = frozenset({*LETTERS, "T", "B1", "C1"})
 OFFERING: Final = ("B", "C", "D", "G", "G+")
 SUPPLY: Final = 25.0
-"""A for three slaves, each of which may ask for 16 A."""
+"""A for three boxes, each of which may ask for 16 A."""
+NODES: Final = ("2.30", "2.30+", "3")
+"""Dialects of nodes that may have one master."""
 
 
 class WatchedSmartEvse(WatchedBox[SmartEvse]):
@@ -69,11 +75,19 @@ class WatchedSmartEvse(WatchedBox[SmartEvse]):
             ),
             f"settings.{Setting.MINIMUM_CURRENT}": settings["min_current"],
             f"settings.{Setting.MAXIMUM_CURRENT}": settings["max_current"],
-            "1.state": box.state,
+            "1.state": self._state,
             "1.plugged": plugged,
             "1.charging": box.contactor,
             "1.minimum": settings["min_current"],
         }
+
+    @property
+    def _state(self) -> str:
+        """Return the letter by which the library calls its state."""
+        code = self.device.controller.dialect.states[self.device.state]
+        if code in range(len(LETTERS)):
+            return LETTERS[code]
+        return self.device.state if self.device.state in NAMED else str(code)
 
     @override
     def shown(self) -> Values:
@@ -136,26 +150,32 @@ class PolledScene(Scene):
 
 
 class SlaveScene(Scene):
-    """Three slaves of 2.17 under our master, on a supply that is not enough for all."""
+    """Slaves of 2.17 or nodes under our master, on a supply that is not enough for all."""
 
     allowed_over = 30.0
 
-    def __init__(self, seed: int) -> None:
-        """Describe them."""
+    def __init__(
+        self,
+        seed: int,
+        *,
+        dialects: Sequence[str] = ("2.17",) * 3,
+    ) -> None:
+        """Describe them, from unit 2 on."""
         super().__init__()
         self._seed = seed
+        self._dialects = dialects
 
     @override
     async def make(self) -> None:
         made = [
             SmartEvse(
-                "2.17",
+                dialect,
                 load_balance=unit,
                 car=visiting_car(self._seed * 10 + unit, max_current=32.0),
                 cable=32,
                 max_current=int(LIMIT),
             )
-            for unit in (2, 3, 4)
+            for unit, dialect in enumerate(self._dialects, 2)
         ]
         self.virtual = VirtualBus.in_loop(*made, seed=self._seed, ring=100, tick=TICK)
         self.virtual.start()
@@ -168,5 +188,7 @@ class SlaveScene(Scene):
             self.bus.add(charger)
             self.boxes.append(WatchedSmartEvse(box, charger))
         self.shared = LimitWatch(
-            lambda: sum(box.offered() for box in self.boxes), lambda: SUPPLY, 0.0
+            lambda: sum(box.offered() for box in self.boxes),
+            lambda: SUPPLY,
+            0.0,
         )
