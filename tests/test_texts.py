@@ -33,6 +33,7 @@ from custom_components.evse_bus.issues import (
     LINE_TOO_SLOW,
     LOST,
     LOWER_MAXIMUM,
+    MIXED_FIRMWARE,
     MODBUS_TCP,
     NO_SUCH_PORT,
     NOT_STORED,
@@ -44,7 +45,6 @@ from custom_components.evse_bus.issues import (
     SUPPLY_LOST,
     TIMEOUT_RAISED,
     UNKNOWN_FIRMWARE,
-    UNSUPPORTED_FIRMWARE,
     WRONG_CHARGER,
 )
 from tests.flow import english
@@ -150,7 +150,7 @@ def test_issues_have_texts() -> None:
         SUPPLY_LOST,
         TIMEOUT_RAISED,
         UNKNOWN_FIRMWARE,
-        UNSUPPORTED_FIRMWARE,
+        MIXED_FIRMWARE,
         WRONG_CHARGER,
     }
 

@@ -164,9 +164,12 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
 
     @callback
     def _on_master(self) -> None:
+        self._check_bus()
+        self._notify(BUS)
+
+    def _check_bus(self) -> None:
         if self.connections.master is not None:
             self.issues.check_bus(self.connections.master.noticed)
-        self._notify(BUS)
 
     async def async_permission_set(self, managed: ManagedCharger) -> None:
         """Accept that the user has decided whether a charger may charge."""
@@ -183,6 +186,7 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
     @callback
     def on_removed(self) -> None:
         """Count the chargers anew."""
+        self._check_bus()
         self._notify(BUS)
 
     @callback
@@ -197,7 +201,8 @@ class BusCoordinator(BaseDataUpdateCoordinatorProtocol):
         """Handle a changed reading, state or configuration of a charger."""
         charger = managed.charger
         self.all_chargers.store_address(managed)
-        self.all_chargers.store_facts(managed)
+        if self.all_chargers.store_facts(managed):
+            self._check_bus()
         reading = charger.reading
         before = managed.connectors
         managed.connectors = (

@@ -8,9 +8,16 @@ from homeassistant.config_entries import ConfigEntry
 from homeassistant.core import HomeAssistant
 from homeassistant.helpers import device_registry as dr, issue_registry as ir
 
+from .chargers.kinds import Member, find_mix
 from .chargers.managed import ManagedCharger
 from .configuration import protocol_of
-from .const import CONF_ENTRY, CONF_SERIAL, CONF_SUBENTRY, DOMAIN
+from .const import (
+    CONF_ENTRY,
+    CONF_SERIAL,
+    CONF_SUBENTRY,
+    DOMAIN,
+    SUBENTRY_CHARGER,
+)
 from .evse.bus import Bus
 from .evse.load import Overload
 from .evse.model import Fault, Orders, Setting
@@ -24,6 +31,7 @@ SUPPLY_LOST: Final = "supply_lost"
 TIMEOUT_RAISED: Final = "timeout_raised"
 ENERGY_NOT_COUNTED: Final = "energy_not_counted"
 SECOND_MASTER: Final = "second_master"
+MIXED_FIRMWARE: Final = "mixed_firmware"
 MODBUS_TCP: Final = "modbus_tcp"
 REPLIES_TOO_LATE: Final = "replies_too_late"
 LINE_TOO_SLOW: Final = "line_too_slow"
@@ -43,7 +51,6 @@ DUPLICATE_ADDRESS: Final = "duplicate_address"
 SHARED_ADDRESS: Final = "shared_address"
 NO_SUCH_PORT: Final = "no_such_port"
 UNKNOWN_FIRMWARE: Final = "unknown_firmware"
-UNSUPPORTED_FIRMWARE: Final = "unsupported_firmware"
 
 
 type Fix = dict[str, str | int | float | None]
@@ -184,11 +191,32 @@ class BusIssues:
 
     def check_bus(self, noticed: AbstractSet[Fault]) -> None:
         """Report or clear faults of the whole bus."""
+        is_mixed = Fault.MIXED_DIALECTS in noticed
+        self._set(
+            MIXED_FIRMWARE,
+            self._entry.entry_id,
+            present=is_mixed,
+            placeholders={
+                "bus": self._entry.title,
+                "chargers": self._mix() if is_mixed else "-",
+            },
+        )
         self._set(
             SECOND_MASTER,
             self._entry.entry_id,
             present=Fault.SECOND_MASTER in noticed,
             placeholders={"bus": self._entry.title},
+        )
+
+    def _mix(self) -> str:
+        """Return the boxes that cannot have one bus; all, until their facts are kept."""
+        boxes = [
+            Member.of_stored(one)
+            for one in self._entry.get_subentries_of_type(SUBENTRY_CHARGER)
+        ]
+        return find_mix(self._protocol, boxes) or "\n".join(
+            f"- {box.title} ({self._protocol.address.label(box.address)})"
+            for box in boxes
         )
 
     def check_line(self, bus: Bus) -> None:
@@ -225,6 +253,7 @@ class BusIssues:
             self._check_wrong_charger(managed, texts)
         faults = {
             NO_SUCH_PORT: Fault.NO_SUCH_PORT in charger.faults,
+            UNKNOWN_FIRMWARE: Fault.UNSUPPORTED_FIRMWARE in charger.faults,
             DUPLICATE_ADDRESS: is_duplicate and not charger.shares_address,
             SHARED_ADDRESS: is_duplicate and charger.shares_address,
         }
@@ -236,7 +265,6 @@ class BusIssues:
                 placeholders=texts
                 | {"address": self._protocol.address.label(charger.config.address)},
             )
-        self._check_firmware(managed, texts)
         self._check_timeout(managed)
         self._check_beginning(managed)
 
@@ -279,19 +307,6 @@ class BusIssues:
         if given is None:
             return managed.name
         return given if managed.port_count == 1 else f"{given} {managed.port_number}"
-
-    def _check_firmware(self, managed: ManagedCharger, texts: dict[str, str]) -> None:
-        """Report a firmware that is unknown, or that this protocol does not support."""
-        charger = managed.charger
-        present = Fault.UNSUPPORTED_FIRMWARE in charger.faults
-        firmware = charger.info.firmware if charger.info is not None else None
-        for key in (UNKNOWN_FIRMWARE, UNSUPPORTED_FIRMWARE):
-            self._set(
-                key,
-                managed.key,
-                present=present and (key == UNKNOWN_FIRMWARE) == (firmware is None),
-                placeholders=texts | {"firmware": firmware or "-"},
-            )
 
     def _check_timeout(self, managed: ManagedCharger) -> None:
         """Report a fail-safe time-out in use that is longer than the one ordered."""

@@ -157,12 +157,8 @@ class AllowedSwitch(_ChargerSwitch):
         A charger that we have paused for lack of current stays allowed: it resumes
         without being switched on again.
         """
-        charger = self.charger
-        allowed = charger.reading.allowed if charger.reading is not None else None
-        if allowed is None or (allowed is False and charger.waits_for_current):
-            allowed = charger.orders.allowed is not False
-        self._attr_is_on = allowed
-        return allowed
+        self._attr_is_on = self.charger.is_allowed
+        return self._attr_is_on
 
     @override
     async def async_set(self, *, on: bool) -> None:

@@ -382,8 +382,8 @@ class BusChargers:
             data={**managed.subentry.data, CONF_ADDRESS: address},
         )
 
-    def store_facts(self, managed: ManagedCharger) -> None:
-        """Store what was read of the box, where it differs from what is kept."""
+    def store_facts(self, managed: ManagedCharger) -> bool:
+        """Store what was read of the box; return whether it differs from what was kept."""
         charger, subentry = managed.charger, managed.subentry
         data = dict(subentry.data)
         for name, text in charger.facts.items():
@@ -396,7 +396,9 @@ class BusChargers:
         elif not data.get(CONF_SERIAL) and charger.other_serial is not None:
             # A restart knows then whose box it is, and still accepts any other.
             data[CONF_REFUSED] = charger.other_serial
-        if data != subentry.data:
-            self._hass.config_entries.async_update_subentry(
-                self._entry, subentry, data=data
-            )
+        if data == subentry.data:
+            return False
+        self._hass.config_entries.async_update_subentry(
+            self._entry, subentry, data=data
+        )
+        return True

@@ -234,6 +234,18 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         return False
 
     @property
+    def is_allowed(self) -> bool:
+        """Return whether it may charge: by its own account, else by the orders.
+
+        One that we have paused for lack of current stays allowed: it resumes without
+        being allowed again.
+        """
+        allowed = self.reading.allowed if self.reading is not None else None
+        if allowed is None or (allowed is False and self.waits_for_current):
+            return self.orders.allowed is not False
+        return allowed
+
+    @property
     def pause_reason(self) -> PauseReason | None:
         """Return why no car can charge now; ``None``: nothing known prevents it.
 

@@ -9,6 +9,7 @@ from homeassistant.config_entries import ConfigSubentry, ConfigSubentryData
 from homeassistant.const import CONF_ADDRESS, CONF_NAME
 from homeassistant.data_entry_flow import FlowContext, FlowResult
 
+from ..chargers.kinds import Member, find_mix
 from ..configuration import line_settings
 from ..connections import connection_name, line_memory
 from ..const import CONF_INSTALLATION_LIMIT, SUBENTRY_CHARGER
@@ -27,7 +28,6 @@ from .charger import (
     confirm_row,
     default_name,
 )
-from .kinds import Member, find_mix
 from .progress import async_show_long_enough
 from .schema import (
     CONF_CHARGERS,

@@ -14,6 +14,7 @@ from homeassistant.config_entries import (
 )
 from homeassistant.const import CONF_ADDRESS, CONF_NAME
 
+from ..chargers.kinds import Member, find_mix
 from ..configuration import protocol_of
 from ..connections import Connections, ListenerConnections
 from ..const import (
@@ -34,7 +35,6 @@ from .charger import (
     charger_suggestions,
     check_charger,
 )
-from .kinds import Member, find_mix
 from .listener import found_box
 from .search import async_search, read_only_probe
 from .steps import ChargerSteps

@@ -153,7 +153,7 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Member):
         habits = self._habits
         if habits is None:
             return None
-        return FailSafe.STOPS if habits.fail_safe_proven else FailSafe.NOTHING
+        return FailSafe.STOPS if habits.fail_safe_proven else FailSafe.UNPROVEN
 
     @property
     @override
@@ -225,6 +225,13 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Member):
     @override
     def waits_for_current(self) -> bool:
         return self._paused_by_us
+
+    @property
+    @override
+    def is_allowed(self) -> bool:
+        # Where access is not written for a pause, it stays on meanwhile.
+        is_off = not self._has_volatile_access and self.orders.allowed is False
+        return super().is_allowed and not is_off
 
     @property
     @override
