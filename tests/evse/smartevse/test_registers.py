@@ -120,7 +120,7 @@ def test_no_communication_as_recorded() -> None:
     status = decode_status(V2_17, data)
     assert faults_of(V2_17, status) == {Fault.NO_COMM}
     assert ocpp_status(V2_17, status) is OcppStatus.FAULTED
-    assert not shows_plug(V2_17, status)
+    assert not shows_plug(status)
 
 
 def test_configuration_as_recorded() -> None:
@@ -390,11 +390,11 @@ def test_a_dialect_is_found_only_by_its_own_registers(
 
 def test_a_without_access_is_not_unplugged() -> None:
     status = decode_status(V2_17, words(0x41, 0, 16, 6, 0, 0, 130, 0, 0))
-    assert not shows_plug(V2_17, status)
+    assert not shows_plug(status)
     assert ocpp_status(V2_17, status) is OcppStatus.OUT_OF_SERVICE
     assert is_stopped(V2_17, status)
     assert offered(V2_17, status) == 0
-    assert shows_plug(V2_17, replace(status, access=True))
+    assert shows_plug(replace(status, access=True))
 
 
 def test_later_states() -> None:
@@ -404,7 +404,7 @@ def test_later_states() -> None:
     waiting = replace(stopping, raw_state="B1", access=False)
     assert is_stopped(HEAD, waiting)
     assert ocpp_status(HEAD, waiting) is OcppStatus.SUSPENDED_EVSE
-    assert shows_plug(HEAD, waiting)
+    assert shows_plug(waiting)
     assert stopping.serial == "4711"
     assert stopping.temperature == 20
 

@@ -153,7 +153,7 @@ def test_a_car_that_may_be_in_is_never_shown_as_gone(dialect: Dialect) -> None:
         and (one.status.access is False or one.status.error)
         and "unplugged" not in one.what
     ]
-    assert all(not shows_plug(dialect, status) for status in hidden)
+    assert all(not shows_plug(status) for status in hidden)
     if dialect is Dialect.V2_HEAD:
         # It reports B1 instead.
         assert not hidden

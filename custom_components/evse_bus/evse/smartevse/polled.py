@@ -52,6 +52,7 @@ from .config import PolledConfig
 from .dialects import MAPS, Status
 from .memory import SmartEvseMemory
 from .mode import mode_conversation
+from .plug import has_restarted
 from .reader import READ_AGAIN, TIMING, WRITES
 from .registers import tenths, write_current
 from .states import (
@@ -241,7 +242,7 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
 
     @override
     def on_status(self, status: Status, now: float) -> None:
-        if self.has_restarted(status):
+        if self.status is not None and has_restarted(self.status, status):
             self._written = None
         super().on_status(status, now)
         charging = status.raw_state in CHARGING
@@ -262,12 +263,13 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
     def _follow_car(self, status: Status, now: float) -> None:
         """Take note of when the car began to charge, and of its leaving."""
         dialect = self.known_dialect
+        row = MAPS[dialect]
         if status.raw_state in CHARGING:
             if self._charging_since is None:
                 self._charging_since = now
-        elif status.raw_state == UNPLUGGED and shows_plug(dialect, status):
+        elif status.raw_state == UNPLUGGED and (row.shows_plug or shows_plug(status)):
             self._charging_since = None
-        row, since = MAPS[dialect], self._charging_since
+        since = self._charging_since
         current = offered(dialect, status)
         self._searches = (
             since is not None
@@ -390,9 +392,7 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
         the override takes precedence over the box's own knowledge of it: 6 A until then.
         """
         dialect = self.known_dialect
-        plugged = (
-            shows_plug(dialect, status) and state_of(dialect, status.raw_state).plugged
-        )
+        plugged = state_of(dialect, status.raw_state).plugged
         if plugged and status.maximum is not None and not setpoint.paused:
             return setpoint
         limits = replace(self.limits, reported=MINIMUM_CURRENT, minimum=MINIMUM_CURRENT)

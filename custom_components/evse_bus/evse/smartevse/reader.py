@@ -28,6 +28,7 @@ from ..model import (
     Capability,
     Fault,
     Limits,
+    Mode,
     Orders,
     Setting,
 )
@@ -35,6 +36,7 @@ from ..pause_watch import FOLLOW_TIME
 from ..registers import Block, Registers
 from .config import SmartEvseConfig
 from .dialects import LATER, MAPS, PROBE_A0, Dialect, Status
+from .plug import PlugWatch, has_restarted
 from .probing import find_dialect
 from .readings import capabilities_of, charger_info, charger_reading
 from .registers import (
@@ -49,7 +51,7 @@ from .registers import (
     write_access,
     write_answer,
 )
-from .states import CHARGING, UNPLUGGED, WAITING, is_stopped, shows_plug
+from .states import CHARGING, is_stopped
 
 TIMING: Final = Timing(
     # More than 3 ms of silence end a frame, and a box replies after more than 6 ms.
@@ -74,11 +76,6 @@ CONFIGURATION_INTERVAL: Final = 300.0
 """Time between two readings of a box's settings, s."""
 CONFIGURATION_RETRY: Final = 30.0
 """Pause after settings that could not be read, s."""
-HIDDEN_BY_ERROR: Final = 65.0
-"""After an error, ``A`` may mean a plugged car for this long, s: a box waits for 60 s
-before it resumes."""
-HIDDEN_BY_START: Final = 10.0
-"""After its power-up and after NO_COMM likewise, s; 7 s were recorded."""
 COLD: Final = 5
 """From at most so many degrees Celsius, above or below 0, a reading of 0 is believed."""
 
@@ -101,7 +98,7 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
         self.must_close_access = False
         """Pending cleanup: writing a setting may have opened access that was off."""
         self._serial: str | None = None
-        self._plug_hidden_until = 0.0
+        self._plug = PlugWatch()
         self._temperature: int | None = None
         """The last temperature that it has measured, degrees Celsius."""
         self._implausible_replies = 0
@@ -160,7 +157,6 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
         self.status = None
         self.configuration = None
         self.configuration_due = 0.0
-        self._plug_hidden_until = 0.0
         self._temperature = None
 
     @override
@@ -170,6 +166,7 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
         self.status = None
         # Or it was switched off and on again.
         self._temperature = None
+        self._plug.missed()
 
     # -- Identity ------------------------------------------------------------------
 
@@ -315,14 +312,16 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
     def on_status(self, status: Status, now: float) -> None:
         """Accept a status, and make a reading of it."""
         dialect = self.known_dialect
-        self._hide_plug(dialect, status, now)
+        plugged = self._plug.see(
+            dialect, status, now, may_be_refused=self._may_be_refused(status)
+        )
         status = self._with_measured_temperature(status)
         self.status = status
         reading = charger_reading(
             dialect,
             status,
             self.configuration,
-            plug_known=now >= self._plug_hidden_until,
+            plugged=plugged,
             waits=self.waits_for_current,
         )
         if reading != self.reading:
@@ -334,39 +333,26 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
             patience=FOLLOW_TIME if status.raw_state in CHARGING else None,
         )
 
+    def _may_be_refused(self, status: Status) -> bool:
+        """Return whether it may have been refused current while it was out of sight.
+
+        Without load balancing and in the mode normal there is nothing to refuse it.
+        """
+        is_alone = self.config.address <= 1 and status.mode is Mode.NORMAL
+        return not (self.available or is_alone)
+
     def _with_measured_temperature(self, status: Status) -> Status:
         """Return a status without the 0 degrees that a box reports after power-up.
 
         They are believed from one that was about as cold before.
         """
-        before = None if self.has_restarted(status) else self._temperature
+        before = self._temperature
+        if self.status is not None and has_restarted(self.status, status):
+            before = None
         if status.temperature == 0 and (before is None or abs(before) > COLD):
             status = replace(status, temperature=None)
         self._temperature = status.temperature
         return status
-
-    def has_restarted(self, status: Status) -> bool:
-        """Return whether a new status shows that the box was switched off and on."""
-        before = self.status
-        # Only a restart forgets the cable.
-        return before is not None and bool(before.maximum) and status.maximum is None
-
-    def _hide_plug(self, dialect: Dialect, status: Status, now: float) -> None:
-        """Take note of how long ``A`` does not mean that there is no car."""
-        before = self.status
-        hidden = 0.0
-        if not shows_plug(dialect, status):
-            # A car that keeps its request stays in A when access is on again.
-            hidden = HIDDEN_BY_ERROR if status.access else inf
-        elif status.raw_state != UNPLUGGED:
-            self._plug_hidden_until = 0.0
-        elif (
-            before is None or before.raw_state in WAITING or self.has_restarted(status)
-        ):
-            # Perhaps it was just switched on, or cleared NO_COMM: it knows of no cable,
-            # or was out of sight. Or its master was late, and it asks again.
-            hidden = HIDDEN_BY_START
-        self._plug_hidden_until = max(self._plug_hidden_until, now + hidden)
 
     # -- Configuration -------------------------------------------------------------
 

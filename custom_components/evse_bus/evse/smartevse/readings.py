@@ -8,11 +8,9 @@ from .dialects import MAPS, VERSION_3, Dialect, Status
 from .registers import Configuration
 from .states import (
     UNKNOWN,
-    UNPLUGGED,
     faults_of,
     ocpp_status,
     offered,
-    shows_plug,
     state_of,
 )
 
@@ -61,18 +59,14 @@ def charger_reading(
     status: Status,
     configuration: Configuration | None,
     *,
-    plug_known: bool,
+    plugged: bool | None,
     waits: bool = False,
 ) -> ChargerReading:
     """Return the reading of a status.
 
-    ``plug_known``: ``A`` means unplugged; else a missing access or an error may have
-    just hidden a plugged car. ``waits``: paused by us for lack of current.
+    ``plugged``: see `plug`. ``waits``: paused by us for lack of current.
     """
     state = state_of(dialect, status.raw_state)
-    hidden = status.raw_state == UNPLUGGED and not (
-        plug_known and shows_plug(dialect, status)
-    )
     settings = configuration.settings if configuration is not None else {}
     maxima = [status.maximum, settings.get(Setting.MAXIMUM_CURRENT)]
     if configuration is None and not MAPS[dialect].reports_maximum:
@@ -85,7 +79,7 @@ def charger_reading(
     connector = ConnectorReading(
         status=ocpp,
         raw_state=status.raw_state,
-        plugged=None if hidden else state.plugged,
+        plugged=plugged,
         charging=state.charging,
         minimum_current=None if minimum is None else float(minimum),
     )

@@ -81,15 +81,14 @@ def faults_of(dialect: Dialect, status: Status) -> frozenset[Fault]:
     return frozenset(fault for bit, fault in names.items() if status.error & bit)
 
 
-def shows_plug(dialect: Dialect, status: Status) -> bool:
+def shows_plug(status: Status) -> bool:
     """Return whether the state shows if a car is plugged in.
 
-    Without access, and while an error has stopped the car, some dialects report ``A``
-    for it (`Map.shows_plug`).
+    Without access, and while an error stands, all dialects report ``A`` for a car that
+    comes then, and some for one that was there before (`Map.shows_plug`).
     """
-    if status.raw_state != UNPLUGGED or MAPS[dialect].shows_plug:
-        return True
-    return status.access is True and not faults_of(dialect, status)
+    is_unplugged = status.raw_state == UNPLUGGED
+    return not is_unplugged or (status.access is True and not status.error)
 
 
 def is_stopped(dialect: Dialect, status: Status) -> bool:
