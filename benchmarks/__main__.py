@@ -23,6 +23,7 @@ from . import (
     slow_lines,
     smartevse_master,
     smartevse_polled,
+    sun,
 )
 from .figures import Figure, results, table
 from .machine import OUTPUT, machine
@@ -45,6 +46,7 @@ BENCHMARKS: Final = {
         adapter_away,
         slow_lines,
         hostile_bytes,
+        sun,
     )
 }
 
