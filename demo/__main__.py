@@ -97,7 +97,7 @@ async def _run(settings: Settings, programs: list[Program]) -> None:
             for program, bus in zip(programs, BUSES, strict=True)
         )
     )
-    lines = [str(settings.link(bus.protocol)) for bus in BUSES if not bus.dials]
+    lines = [str(settings.link(bus.name)) for bus in BUSES if not bus.dials]
     report(f"virtual buses: {', '.join(lines)}")
     while True:
         home = await _start_home(settings)
@@ -125,7 +125,7 @@ async def _start_bus(settings: Settings, bus: DemoBus) -> Program:
         ROOT / "scripts" / "virtual-chargers",
         *bus.arguments(settings),
         "--verbose",
-        log=settings.folder / f"bus-{bus.protocol}.log",
+        log=settings.folder / f"bus-{bus.name}.log",
         cwd=ROOT,
     )
 

@@ -15,7 +15,9 @@ class DemoBus:
     """One virtual bus and its chargers."""
 
     protocol: str
-    """Key of the protocol; also in the names of port and log."""
+    """Key of the protocol."""
+    key: str = ""
+    """In the names of port and log, where another bus has the same protocol."""
     title: str
     virtual: tuple[str, ...]
     """Arguments of scripts/virtual-chargers, without the line."""
@@ -34,6 +36,11 @@ class DemoBus:
     """Steps from the port to the chargers found."""
 
     @property
+    def name(self) -> str:
+        """Return its name for port and log."""
+        return self.key or self.protocol
+
+    @property
     def ready(self) -> str:
         """Return the output of the virtual chargers once the port exists."""
         return f"ready {self.virtual[0]} "
@@ -42,7 +49,7 @@ class DemoBus:
         """Return all arguments of scripts/virtual-chargers."""
         if self.dials:
             return (*self.virtual, "--dial", f"{HOST}:{settings.listen_port}")
-        return (*self.virtual, "--pty", str(settings.link(self.protocol)))
+        return (*self.virtual, "--pty", str(settings.link(self.name)))
 
     def answers(self, settings: Settings) -> dict[str, Answer]:
         """Return the values for the steps of the config flow, and of discovered boxes."""
@@ -50,7 +57,7 @@ class DemoBus:
         line: dict[str, Answer] = (
             {"listen": listen, "discovered": {}}
             if self.dials
-            else {"port": {"device": str(settings.link(self.protocol))}}
+            else {"port": {"device": str(settings.link(self.name))}}
         )
         return {
             **self.choose,
@@ -129,7 +136,10 @@ BUSES: Final = (
             *("smartevse", "--load-balance", "2", "3", "--max-current", "16"),
             *("--seed", "3", *_LIFE),
         ),
-        names={"Slave 1": "Barn left", "Slave 2": "Barn right"},
+        names={
+            "Slave 1 / Node 1": "Barn left",
+            "Slave 2 / Node 2": "Barn right",
+        },
         currents={"Barn left": 16.0, "Barn right": 16.0},
         connectors=2,
         choose={
@@ -139,6 +149,31 @@ BUSES: Final = (
         search={
             # Less than both could use, so that one car more or less shows.
             "supply": {"supply_limit": 25, "supply_minimum": 6},
+            "select": {"installation_limit": 16},
+        },
+    ),
+    DemoBus(
+        protocol="smartevse_master",
+        key="smartevse_nodes",
+        title="SmartEVSE bus, later firmware, Home Assistant as master",
+        virtual=(
+            *("smartevse", "--dialect", "2.30", "2.30", "3"),
+            *("--load-balance", "2", "3", "8", "--max-current", "16"),
+            *("--seed", "7", *_LIFE),
+        ),
+        names={
+            "Slave 1 / Node 1": "Office left",
+            "Slave 2 / Node 2": "Office right",
+            "Node 7": "Office gate",
+        },
+        currents={"Office left": 16.0, "Office right": 16.0, "Office gate": 13.0},
+        connectors=3,
+        choose={
+            "user": {"protocol": "smartevse"},
+            "mode": {"next_step_id": "master"},
+        },
+        search={
+            "supply": {"supply_limit": 32, "supply_minimum": 6},
             "select": {"installation_limit": 16},
         },
     ),

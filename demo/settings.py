@@ -50,9 +50,9 @@ class Settings:
         """Return the log of Home Assistant."""
         return self.folder / "home-assistant.log"
 
-    def link(self, protocol: str) -> Path:
+    def link(self, name: str) -> Path:
         """Return the path of a virtual bus: the same at each start."""
-        return self.folder / f"tty{protocol.upper()}"
+        return self.folder / f"tty{name.upper()}"
 
 
 def from_environment() -> Settings:

@@ -117,6 +117,10 @@ async def test_buses_are_added_once_and_all_is_on_the_dashboard(
     slaves = [
         SmartEvse(load_balance=unit, max_current=16, car=_plugged()) for unit in (2, 3)
     ]
+    nodes = [
+        SmartEvse(dialect, load_balance=unit, max_current=16)
+        for dialect, unit in (("2.30", 2), ("2.30", 3), ("3", 8))
+    ]
     workshop = EwsBox(serial="201609000417", cars=(_plugged(), None))
     loading_bay = EwsBox(serial="201802000093", cars=(None, _plugged()))
     with (
@@ -124,6 +128,7 @@ async def test_buses_are_added_once_and_all_is_on_the_dashboard(
         VirtualBus.pty(*boxes, link=str(settings.link("abl"))),
         VirtualBus.pty(polled, link=str(settings.link("smartevse"))) as single,
         VirtualBus.pty(*slaves, link=str(settings.link("smartevse_master"))) as shared,
+        VirtualBus.pty(*nodes, link=str(settings.link("smartevse_nodes"))) as later,
         VirtualBus.pty(workshop, link=str(settings.link("ews"))) as serial,
         EwsDialler(loading_bay, "127.0.0.1", settings.listen_port) as dialler,
     ):
@@ -138,6 +143,7 @@ async def test_buses_are_added_once_and_all_is_on_the_dashboard(
         await shared.wait_for_async(
             lambda: [slave.pilot_current for slave in slaves] == [12.5, 12.5], 15
         )
+        await later.wait_for_async(lambda: nodes[2].broadcasts, 15)
         # A start request is allowed, at its own port.
         for bus, box, number in ((serial, workshop, 1), (dialler, loading_bay, 2)):
             port = box.ports[number - 1]
@@ -171,7 +177,7 @@ async def test_buses_are_added_once_and_all_is_on_the_dashboard(
         assert {
             f"number.{name}_charging_current"
             for name in (
-                *("garage", "guests", "courtyard", "barn_left"),
+                *("garage", "guests", "courtyard", "barn_left", "office_gate"),
                 *("workshop_port_1", "workshop_port_2", "loading_bay_port_2"),
             )
         } < entities
