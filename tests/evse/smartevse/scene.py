@@ -16,6 +16,7 @@ from custom_components.evse_bus.evse.modbus import RtuFramer
 from custom_components.evse_bus.evse.model import Circuit, CurrentLimit, Orders
 from custom_components.evse_bus.evse.smartevse import MASTER
 from custom_components.evse_bus.evse.smartevse.config import SlaveConfig
+from custom_components.evse_bus.evse.smartevse.dialects import Dialect
 from custom_components.evse_bus.evse.smartevse.master import Master
 from custom_components.evse_bus.evse.smartevse.slave import SlaveSmartEvse
 from tests.evse.simulated_line import LiveScene, SimulatedLine
@@ -155,6 +156,8 @@ class MasterScene(LiveScene):
     maximum: int = 16
     watch: bool = True
     dialect: str = "2.17"
+    kept: Dialect | None = None
+    """Dialect of the slaves, as found earlier."""
     line: SmartEvseLine = field(init=False)
     bus: Bus = field(init=False)
     master: Master = field(init=False)
@@ -204,6 +207,7 @@ class MasterScene(LiveScene):
             name=f"slave {unit}",
             address=unit,
             installation_limit=32.0,
+            dialect=self.kept,
         )
         usual = {"limit": CurrentLimit(current=self.current), "allowed": self.allowed}
         return SlaveSmartEvse(config, Orders(**(usual | orders)))  # type: ignore[arg-type]

@@ -14,6 +14,7 @@ from custom_components.evse_bus.evse.smartevse.dialects import (
 from custom_components.evse_bus.evse.smartevse.sharing import (
     LOWEST,
     Claim,
+    Contactor,
     Draw,
     above_share,
     fit_to_limit,
@@ -140,22 +141,22 @@ def test_a_value_out_of_range_counts_as_the_lowest() -> None:
 
 def test_a_draw_counts_everything_a_box_may_be_following() -> None:
     draw = Draw(ROW)
-    draw.read(100, 0.0, closed=True)
+    draw.read(100, 0.0, Contactor.CLOSED)
     draw.sent(80, 1.0)
     assert draw.most(1.0) == 100
-    draw.read(80, 1.2, closed=True)
+    draw.read(80, 1.2, Contactor.CLOSED)
     assert draw.most(1.2) == 80
     draw.sent(130, 2.0)
     assert draw.most(2.0) == 130
-    draw.read(80, 2.2, closed=True)
+    draw.read(80, 2.2, Contactor.CLOSED)
     assert draw.most(2.2) == 80
-    draw.read(130, 2.2, closed=False)
+    draw.read(130, 2.2, Contactor.OPEN)
     assert draw.most(2.2) == 0
 
 
 def test_a_box_that_does_not_answer_may_still_receive() -> None:
     draw = Draw(ROW)
-    draw.read(160, 0.0, closed=True)
+    draw.read(160, 0.0, Contactor.CLOSED)
     for second in range(2, 30, 2):
         draw.sent(60, second)
         most = 160 if second < STOPS_ALONE else 60
@@ -175,21 +176,21 @@ def test_a_draw_is_unknown_before_the_first_broadcast() -> None:
 
 def test_a_grant_counts_until_a_later_broadcast_was_surely_received() -> None:
     draw = Draw(ROW)
-    draw.read(160, 0.0, closed=False)
+    draw.read(160, 0.0, Contactor.OPEN)
     draw.granted(160, 1.0)
     draw.sent(80, 2.0)
     assert draw.most(2.0) == 160
     # 0 may be the memory of a box that was switched off and on before the grant.
-    draw.read(0, 2.1, closed=True)
+    draw.read(0, 2.1, Contactor.CLOSED)
     assert draw.most(2.1) == 160
     draw.sent(80, 3.0)
-    draw.read(80, 3.1, closed=True)
+    draw.read(80, 3.1, Contactor.CLOSED)
     assert draw.most(3.1) == 80
 
 
 def test_a_repeated_request_does_not_undo_its_grant() -> None:
     draw = Draw(ROW)
-    draw.read(100, 0.0, closed=False)
+    draw.read(100, 0.0, Contactor.OPEN)
     draw.granted(100, 1.0)
     draw.requested(1.1)
     assert draw.most(1.1) == 100
@@ -223,6 +224,10 @@ class Slave:
         self.silence += seconds
         if self.silence >= STOPS_ALONE - 1:
             self.closed = False
+
+    @property
+    def contactor(self) -> Contactor:
+        return Contactor.CLOSED if self.closed else Contactor.OPEN
 
     @property
     def offers(self) -> int:
@@ -263,7 +268,7 @@ class World:
     def read(self, unit: int) -> None:
         if unit not in self.gone:
             slave = self.slaves[unit]
-            self.draws[unit].read(slave.received, self.now, closed=slave.closed)
+            self.draws[unit].read(slave.received, self.now, slave.contactor)
 
     def ask(self, unit: int, *, arrives: bool) -> None:
         slave = self.slaves[unit]

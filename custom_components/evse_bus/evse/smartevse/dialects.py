@@ -272,11 +272,11 @@ class Balancing:
     """A 0 in the broadcast opens its contactor; else it offers 6 A then."""
     opens_within: float
     """Longest time from a stop that it has received to an open contactor, s."""
-    asks_again_after: float
-    """Time from a 0 in the broadcast to its next request, s; with `zero_stops` only."""
     stops_after: float
     """Longest time without a broadcast after which no current flows, s; inf: it may go
     on for ever."""
+    access_ends_request: bool
+    """Without access it does not go on asking."""
     access_is_volatile: bool
     """Access is on again after a power failure. Else it is in the flash memory, and
     not written for a pause."""
@@ -364,21 +364,21 @@ _NODE: Final = Balancing(
     status=_status_0000(_KELVIN, _ACCESS, words=8),
     zero_stops=True,
     opens_within=OPENS_WITHIN,
-    asks_again_after=0.0,
     stops_after=STOPS_ALONE,
+    access_ends_request=True,
     access_is_volatile=True,
 )
 _GENTLE_NODE: Final = replace(
     _NODE,
     opens_within=OPENS_GENTLY_WITHIN,
-    asks_again_after=16.0,
     stops_after=STOPS_GENTLY,
+    # Only B and C are left for B1 and C1.
+    access_ends_request=False,
 )
 _NODE_3: Final = replace(
     _GENTLE_NODE,
     status=_status_0000(_KELVIN, _ACCESS_3, words=8),
     all_stop_register=None,
-    asks_again_after=15.0,
     access_is_volatile=False,
 )
 
@@ -443,8 +443,8 @@ MAPS: Final[Mapping[Dialect, Map]] = {
             status=_status_a0(_LETTER_STATES),
             zero_stops=False,
             opens_within=OPENS_WITHIN,
-            asks_again_after=0.0,
             stops_after=STOPS_ALONE,
+            access_ends_request=True,
             access_is_volatile=True,
         ),
         socket=Word(0xC0, Flag()),

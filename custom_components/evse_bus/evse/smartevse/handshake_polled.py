@@ -51,7 +51,7 @@ class PolledHandshake:
         if status is None:
             return None
         worst_case = self._slave.worst_case
-        if asks(status) and (self._slave.may_begin or self._must_refuse()):
+        if asks(status) and (self._may_grant or self._must_refuse):
             return FollowUp(partial(self._answer, master), worst_case=worst_case)
         if self._may_clear(status, master):
             return FollowUp(partial(self._clear, master), worst_case=worst_case)
@@ -82,16 +82,19 @@ class PolledHandshake:
     def _habits(self) -> Balancing:
         return MAPS[self._dialect].balancing
 
+    @property
+    def _may_grant(self) -> bool:
+        """Return whether neither its orders nor its share nor its access forbid it."""
+        return self._slave.may_begin and not self._slave.has_no_access
+
+    @property
     def _must_refuse(self) -> bool:
         """Return whether a box that may not begin is refused.
 
-        Where access is not kept, access is turned off instead: from a refusal it needs
-        a minute to come back.
+        Where its access ends the request, that is turned off instead: after a refusal
+        it needs a minute to come back.
         """
-        slave = self._slave
-        return not slave.has_no_access and (
-            slave.withheld or not self._habits.access_is_volatile
-        )
+        return self._slave.withheld or not self._habits.access_ends_request
 
     # -- Answers -------------------------------------------------------------------
 
@@ -113,7 +116,7 @@ class PolledHandshake:
         """Return whether currents must go down first; reserves its share meanwhile."""
         slave = self._slave
         status = self._fresh(master.now)
-        if status is None or not asks(status) or not slave.may_begin:
+        if status is None or not asks(status) or not self._may_grant:
             return False
         slave.reserve(master.now + RESERVED_FOR)
         if master.shares().get(slave.unit, 0) < LOWEST:
@@ -134,13 +137,17 @@ class PolledHandshake:
         slave = self._slave
         now = master.now
         status = self._take(now)
-        if not slave.may_begin or not master.grant(slave.unit):
+        if self._may_grant and master.room(slave.unit) == -inf:
+            raise SupersededError("it waits until all were read")
+        if (
+            not self._may_grant
+            or not master.grant(slave.unit)
+            or not self._fits(master)
+        ):
             slave.reserve(-inf)
-            if slave.may_begin or self._must_refuse():
+            if self._may_grant or self._must_refuse:
                 return refuse_current(slave.unit, self._dialect, status)
-            raise SupersededError("it is stopped in another way")
-        if not self._fits(master):
-            raise SupersededError("it has not received its lower current yet")
+            raise SupersededError("it is stopped by its access")
         if status.raw_state == ASKS_FOR_C:
             master.draw(slave.unit).granted_as_broadcast(now)
         slave.begins(now)
@@ -154,11 +161,10 @@ class PolledHandshake:
         slave = self._slave
         return (
             is_refused(status)
-            and slave.may_begin
-            and not slave.has_no_access
+            and self._may_grant
             # Another error would keep it from asking, and begin its 60 s anew.
             and faults_of(self._dialect, status) == {Fault.LESS_6A}
-            and bool(master.grant(slave.unit))
+            and master.shares().get(slave.unit, 0) >= LOWEST
         )
 
     async def _clear(self, master: Balancer, turn: Turn) -> None:

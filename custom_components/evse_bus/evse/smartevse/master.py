@@ -36,6 +36,7 @@ from .registers import LONGEST_REQUEST, tenths
 from .sharing import (
     LOWEST,
     Claim,
+    Contactor,
     Draw,
     above_share,
     checked,
@@ -300,16 +301,15 @@ class Master(BusMaster):
     # -- Readings of the slaves --------------------------------------------------
 
     def on_status(
-        self, unit: int, value: int, *, closed: bool, ending: bool, complete: bool
+        self, unit: int, value: int, contactor: Contactor, *, complete: bool
     ) -> None:
         """Note a status: the current read back, 0.1 A, and the contactor.
 
-        ``ending``: the pilot offers nothing any more. ``complete``: the settings of
-        the slave are known, too.
+        ``complete``: the settings of the slave are known, too.
         """
         draw = self.draw(unit)
         draw.row = self._habits(unit)
-        draw.read(value, self.now, closed=closed, ending=ending)
+        draw.read(value, self.now, contactor)
         if complete:
             self._on_read(unit)
         self.update_shares()

@@ -7,7 +7,7 @@ from typing import Protocol
 from ..exchange import Request, Turn
 from ..safety import Setpoint
 from .dialects import Dialect, Status
-from .sharing import Claim, Draw
+from .sharing import Claim, Contactor, Draw
 
 
 class Balancer(Protocol):
@@ -39,7 +39,7 @@ class Balancer(Protocol):
         """Look again at the dialects of all slaves: one was read."""
 
     def on_status(
-        self, unit: int, value: int, *, closed: bool, ending: bool, complete: bool
+        self, unit: int, value: int, contactor: Contactor, *, complete: bool
     ) -> None:
         """Note a status: the current read back, 0.1 A, and the contactor."""
 

@@ -24,6 +24,7 @@ What a box does with a 0, and when it stops by itself, differs by its dialect
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from enum import Enum, auto
 from math import inf
 from typing import Final
 
@@ -59,6 +60,17 @@ def offered(value: int) -> int:
     return value if LOWEST <= value <= HIGHEST else LOWEST
 
 
+class Contactor(Enum):
+    """What a state says of the current of a box."""
+
+    OPEN = auto()
+    ASKED = auto()
+    """Open, and it asks for current: its pilot may not follow a broadcast."""
+    CLOSED = auto()
+    ENDING = auto()
+    """It offers nothing any more (C1), but the car may not have followed."""
+
+
 class Draw:
     """The most that one box may be offering a car, from all that is known of it."""
 
@@ -77,6 +89,8 @@ class Draw:
         self._sent: dict[int, float] = {}
         """Values since the last reading, and when each was sent last."""
         self._granted: tuple[float, int] | None = None
+        self._before_grant: frozenset[int] = frozenset()
+        """Values that it may have received last when its request was granted."""
         self._floor: int | None = None
 
     def most(self, now: float) -> float:
@@ -108,12 +122,17 @@ class Draw:
     def at_grant(self) -> int:
         """Return the most that it may offer if its request is granted now, 0.1 A.
 
-        From 2.20 on: that of the last broadcast which it has received.
+        From 2.20 on. While it asks for current, its pilot may stay as it was before.
         """
-        values = [offered(value) for value in self._sent]
+        return max((offered(value) for value in self._possible), default=LOWEST)
+
+    @property
+    def _possible(self) -> frozenset[int]:
+        """Return the values that its pilot may follow."""
+        values = set(self._sent)
         if self._read is not None:
-            values.append(self._read[1])
-        return max(values, default=LOWEST)
+            values.add(self._read[1])
+        return frozenset(values)
 
     @property
     def was_read(self) -> bool:
@@ -146,22 +165,24 @@ class Draw:
     def granted_as_broadcast(self, now: float) -> None:
         """Note that a request is granted now which needs no value (from 2.20 on)."""
         self._granted = (now, self.at_grant)
+        self._before_grant = self._possible
         self.may_draw = True
 
-    def read(
-        self, value: int, now: float, *, closed: bool, ending: bool = False
-    ) -> None:
-        """Note a reading: the value the box received last, and its contactor.
-
-        ``ending``: it offers nothing any more (C1), but the car may not have followed.
-        """
-        if ending:
+    def read(self, value: int, now: float, contactor: Contactor) -> None:
+        """Note a reading: the value the box received last, and its contactor."""
+        if contactor is Contactor.ASKED:
+            self._sent[value] = now
+            self._unknown_since = self._granted = None
+            self.may_draw = False
+            return
+        if contactor is Contactor.ENDING:
             most = self.most(now)
             self.may_draw = True
             if most < inf:
                 self._unknown_since = None
                 self._read = (now, max(int(most), offered(value)))
             return
+        closed = contactor is Contactor.CLOSED
         self.may_draw = closed
         self._unknown_since = None
         self._read = (now, offered(value))
@@ -173,7 +194,7 @@ class Draw:
     def _has_received_since_grant(self, value: int) -> bool:
         """Return whether the value it has received shows what it offers."""
         if self.row.handshake is Handshake.POLLED:
-            return True
+            return value not in self._before_grant
         # No lower value was sent before the grant: so it has received a broadcast
         # since. (0 may also be the memory of a box that was switched off and on.)
         return self._granted is not None and 0 < value < self._granted[1]

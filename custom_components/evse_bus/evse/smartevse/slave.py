@@ -25,6 +25,7 @@ from ..exchange import Request, Turn
 from ..framing import Frame
 from ..modbus import ModbusFrame
 from ..model import (
+    MINIMUM_CURRENT,
     Capability,
     FailSafe,
     Fault,
@@ -55,15 +56,16 @@ from .dialects import (
 from .handshake_polled import PolledHandshake
 from .handshake_requests import RequestHandshake
 from .member import Balancer, Member
-from .reader import READ_AGAIN
+from .reader import READ_AGAIN, TIMING
 from .registers import LONGEST_REQUEST, tenths
-from .sharing import LOWEST, Claim
+from .sharing import LOWEST, Claim, Contactor
 from .states import CHARGING, STOPPING, UNPLUGGED, is_stopped
 
 WITHHELD_FOR: Final = 60.0
 """Shortest pause of a box of 2.17 that was stopped for lack of current, s."""
-WITHHELD_POLLED: Final = 15.0
-"""Likewise from 2.20 on, s: a refused box waits for a minute by itself."""
+WITHHELD_POLLED: Final = 10.0
+"""Likewise from 2.20 on, s: one that asks sooner (up to 2.30) is refused, and waits for
+a minute by itself."""
 BROADCASTS: Final = 4
 """Attempts to broadcast a new current, each followed by its read-back."""
 LONG_STATUS_INTERVAL: Final = 30.0
@@ -72,7 +74,7 @@ block that a master polls, s."""
 
 _ANSWER_BYTES: Final = LONGEST_REQUEST
 """A turn that answers may have a broadcast instead."""
-_OPEN: Final = frozenset({UNPLUGGED, "B", "B1", "T", "F", ASKS_FOR_B, ASKS_FOR_C})
+_OPEN: Final = frozenset({UNPLUGGED, "B", "B1", "T", "F", ASKS_FOR_B})
 """From 2.20 on: the states in which the contactor is surely open."""
 
 
@@ -124,6 +126,11 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Member):
     def _is_polled(self) -> bool:
         habits = self._habits
         return habits is not None and habits.handshake is Handshake.POLLED
+
+    @property
+    def _charges(self) -> bool:
+        """Return whether its contactor may be closed."""
+        return self._master is not None and self._master.draw(self.unit).may_draw
 
     @property
     def master(self) -> Balancer:
@@ -212,6 +219,9 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Member):
         limits = self.limits
         if self._is_leaving:
             share = 0.0
+        if self._is_polled and not self._charges:
+            # A charge begins with the last current that was broadcast before.
+            share = min(share, MINIMUM_CURRENT)
         return clamp(
             self._standing, replace(limits, reported=min(share, limits.ceiling))
         )
@@ -273,8 +283,9 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Member):
         demand = 0 if self._is_leaving else tenths(self.wanted)
         gone = not self.available and self.status is None
         habits = self._habits
-        # Then it takes 6 A as long as it is not confirmed that it has stopped.
-        goes_on = habits is None or not habits.zero_stops
+        if gone and habits and habits.zero_stops and self.misses >= TIMING.misses:
+            # It cannot confirm anything: it gets a 0, and has stopped some time later.
+            return Claim(unit=self.unit, demand=0)
         if not may_draw or (demand >= LOWEST and not self.withheld):
             self._stopping_since = inf
         else:
@@ -286,11 +297,7 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Member):
             )
             return Claim(unit=self.unit, demand=0, fixed=disobeys)
         if may_draw and gone:
-            # Perhaps it still receives the broadcasts. A 0 would stop it, so it comes
-            # after those that are there.
-            return Claim(
-                unit=self.unit, demand=min(demand, LOWEST), since=inf, fixed=goes_on
-            )
+            return Claim(unit=self.unit, demand=min(demand, LOWEST), fixed=True)
         return Claim(unit=self.unit, demand=demand, since=self._charging_since)
 
     @override
@@ -363,12 +370,12 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Member):
             # Without it the limit is 6 A: a box that charges must not wait for it.
             self.read_soon(now)
         charges = status.raw_state in CHARGING
-        closed = status.raw_state not in _OPEN if self._is_polled else charges
+        contactor = self._contactor(status)
         if status.raw_state == UNPLUGGED:
             # The next car may come with another cable.
             self._requests.own_maximum = None
         self._cable = None if status.raw_state == UNPLUGGED else status.maximum
-        if not closed:
+        if contactor in (Contactor.OPEN, Contactor.ASKED):
             if now >= self._reserved_until:
                 self._charging_since = inf
         elif self._charging_since == inf:
@@ -378,14 +385,21 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Member):
         self.master.on_status(
             self.unit,
             round(status.current * 10),
-            closed=closed,
-            ending=status.raw_state == STOPPING,
+            contactor,
             complete=self.configuration is not None,
         )
         self._check_share(status, charges=charges)
         if status.access and self.may_begin:
             # Access is on already: nothing is left to restore.
             self._paused_by_us = False
+
+    def _contactor(self, status: Status) -> Contactor:
+        state = status.raw_state
+        if not self._is_polled:
+            return Contactor.CLOSED if state in CHARGING else Contactor.OPEN
+        special = {ASKS_FOR_C: Contactor.ASKED, STOPPING: Contactor.ENDING}
+        known = Contactor.OPEN if state in _OPEN else Contactor.CLOSED
+        return special.get(state, known)
 
     def _check_share(self, status: Status, *, charges: bool) -> None:
         """Reassert a share that is exceeded; a second time in a row is a fault."""
