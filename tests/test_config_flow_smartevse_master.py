@@ -107,7 +107,7 @@ async def test_slaves_are_found_and_added(hass: HomeAssistant) -> None:
             "| Right | Slave 3 / Node 3 | 13 A | 6 A |"
         )
         assert flow.tells(
-            "25 A per phase", "less than 7 A", "about 10 s", "perhaps never"
+            "25 A per phase", "less than 7 A", "12 s at most", "perhaps never"
         )
         await flow.submit()
 

@@ -54,7 +54,7 @@ async def test_what_a_dialect_has(
             key.removeprefix("bus_") for key in keys
         }
         fail_safe = await get_entity(hass, "sensor", entry, "fail_safe")
-        assert state_of(hass, fail_safe) == "nothing"
+        assert state_of(hass, fail_safe) == "forgets"
 
 
 async def test_a_limit_is_what_the_car_is_offered(hass: HomeAssistant) -> None:

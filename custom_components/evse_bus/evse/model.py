@@ -196,6 +196,9 @@ class FailSafe(StrEnum):
 
     NOTHING = "nothing"
     """The last limit stays in effect."""
+    FORGETS = "forgets"
+    """Likewise, until a power failure of the charger: then nothing limits it but its own
+    maximum, and charging is allowed."""
     FALLS_BACK = "falls_back"
     """It charges with its fail-safe current after its time-out."""
     STOPS = "stops"

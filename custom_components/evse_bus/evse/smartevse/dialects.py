@@ -216,8 +216,8 @@ def _minutes(lowest: int, highest: int) -> Number:
 # -- Load balancing ----------------------------------------------------------------
 
 STOPS_ALONE: Final = 12.0
-"""Time without a broadcast after which a box has stopped by itself, s (10 to 11; seen
-after 8.8 to 9.2)."""
+"""Time without a broadcast after which a box has stopped by itself, s (seen after
+10.7 to 11.1, counted from the last broadcast on the line)."""
 STOPS_GENTLY: Final = 18.0
 """Likewise, where C1 holds the contactor for up to 6 s more."""
 OPENS_WITHIN: Final = 3.0

@@ -36,6 +36,7 @@ from ..model import (
     MINIMUM_CURRENT,
     Command,
     CurrentLimit,
+    FailSafe,
     Fault,
     OrderChange,
     Orders,
@@ -194,6 +195,11 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
         if self._excess is not None:
             not_followed = PauseReason.LIMIT_NOT_FOLLOWED
         return super().pause_reason or not_followed
+
+    @property
+    @override
+    def fail_safe(self) -> FailSafe | None:
+        return FailSafe.FORGETS
 
     @property
     @override
