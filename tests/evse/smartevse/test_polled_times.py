@@ -89,6 +89,8 @@ async def confirmation(dialect: Dialect, past: Past, offset: float, new: float) 
         values = scene.currents(since=began)
         assert values[-1] == new * 10
         assert all(a != b for a, b in pairwise(values)), f"written twice: {values}"
+        if past is steady:
+            assert values == [new * 10]
 
 
 @pytest.mark.parametrize(

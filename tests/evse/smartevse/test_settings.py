@@ -19,7 +19,7 @@ from custom_components.evse_bus.evse.model import (
 from custom_components.evse_bus.evse.smartevse.dialects import MAPS, Dialect
 from tests.simulated_time import now
 
-from .polled_scene import ALL, HEAD, OLDER, V2_17, V2_20, PolledScene, play
+from .polled_scene import ALL, HEAD, LATER, OLDER, V2_17, V2_20, PolledScene, play
 
 each = pytest.mark.parametrize("dialect", ALL)
 
@@ -59,6 +59,50 @@ def test_a_setting_is_that_of_the_same_name_in_the_box(
     scene = play(PolledScene(dialect), acts)
     # Once for each value that was not set before.
     assert sum(scene.box.controller.eeprom_writes.values()) <= 2
+
+
+SOLAR = {
+    Setting.SOLAR_START_CURRENT: 4,
+    Setting.SOLAR_STOP_TIME: 10,
+    Setting.SOLAR_IMPORT_CURRENT: 0,
+}
+"""As a factory-new box shows them in its menu; recorded in 2.20, 2.30 and HEAD."""
+
+
+@pytest.mark.parametrize("dialect", [V2_20, *LATER])
+def test_solar_settings_of_a_factory_new_box(dialect: Dialect) -> None:
+    async def acts(scene: PolledScene) -> None:
+        settings = scene.reading.settings
+        assert {one: settings[one] for one in SOLAR} == SOLAR
+
+    play(PolledScene(dialect), acts)
+
+
+@pytest.mark.parametrize("dialect", [V2_20, *LATER])
+@pytest.mark.parametrize("setting", SOLAR)
+@pytest.mark.parametrize("plugged", [True, False])
+def test_a_solar_setting_is_written_once_and_access_put_back(
+    dialect: Dialect, setting: Setting, *, plugged: bool
+) -> None:
+    async def acts(scene: PolledScene) -> None:
+        if plugged:
+            scene.car.plug_in()
+        await scene.polled(2)
+        assert not scene.outlet.access
+        offered: list[float] = []
+        scene.on_step.append(lambda: offered.append(scene.box.offers))
+        new = scene.charger.settings[setting].maximum
+        for _ in range(2):
+            # Asked for twice, written once.
+            await scene.charger.configure(setting, new)
+            await scene.polled(1)
+            assert scene.reading.settings[setting] == new
+            assert not scene.outlet.access
+        assert sum(scene.box.controller.eeprom_writes.values()) == 1
+        assert len(scene.writes(MAPS[dialect].settings[setting].register)) == 1
+        assert max(offered) == 0
+
+    play(PolledScene(dialect, allowed=False), acts)
 
 
 def test_only_confirmed_settings() -> None:
