@@ -140,6 +140,30 @@ async def test_line_on_which_another_device_asks(hass: HomeAssistant) -> None:
         flow.abort()
 
 
+@pytest.mark.parametrize("load_balance", [0, 1], ids=["disabled", "master"])
+async def test_3x_that_answers_nobody_is_recognised_by_its_requests(
+    hass: HomeAssistant, load_balance: int
+) -> None:
+    box = SmartEvse("3", load_balance=load_balance, settings={"mains_meter": 1})
+    with VirtualBus.in_loop(box) as bus:
+        flow = await smartevse_step(hass, "polled", bus.url)
+        await flow.wait()
+        assert flow.step == "foreign_requests"
+        assert flow.tells("SmartEVSE 3.x", "answers nobody", "Node 1 to 7")
+        flow.abort()
+
+
+async def test_3x_that_answers_and_asks_nobody(hass: HomeAssistant) -> None:
+    """Disabled, and without a meter: the hint is always there."""
+    box = SmartEvse("3", load_balance=0)
+    with VirtualBus.in_loop(box) as bus:
+        flow = await smartevse_step(hass, "polled", bus.url)
+        await flow.wait()
+        assert flow.step == "nothing_found"
+        assert flow.tells("A 3.x never answers with LOAD BAL Disabled or Master")
+        flow.abort()
+
+
 async def test_answers_that_nobody_can_read_may_be_two_boxes(
     hass: HomeAssistant,
 ) -> None:
