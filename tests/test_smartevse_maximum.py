@@ -94,6 +94,20 @@ async def test_the_issue_goes_with_what_causes_it(hass: HomeAssistant) -> None:
         await wait_until(hass, lambda: not issues(hass))
 
 
+async def test_the_issue_goes_with_a_corrected_installation_limit(
+    hass: HomeAssistant,
+) -> None:
+    box = SmartEvse("2.20", max_current=20)
+    async with running(hass, box, installation_limit=16) as (entry, _):
+        await reported(hass, box)
+        [subentry] = entry.subentries.values()
+        hass.config_entries.async_update_subentry(
+            entry, subentry, data={**subentry.data, "installation_limit": 20}
+        )
+        await wait_until(hass, lambda: not issues(hass))
+        assert not box.eeprom_writes
+
+
 async def test_below_its_minimum_it_cannot_be_lowered_from_here(
     hass: HomeAssistant,
 ) -> None:

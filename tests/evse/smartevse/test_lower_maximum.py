@@ -5,7 +5,7 @@ It is the only bound of the current with which a charge begins (PROTOCOLS.md, 3)
 
 import asyncio
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import pytest
@@ -17,9 +17,12 @@ from custom_components.evse_bus.evse.errors import (
 )
 from custom_components.evse_bus.evse.model import OrderChange, Setting
 from custom_components.evse_bus.evse.smartevse.dialects import MAPS, Dialect
-from tests.simulated_time import now
+from tests.simulated_time import now, simulate
+from tests.virtual.smartevse_outlet import SmartEvseOutlet
+from tests.virtual.smartevse_outlet3 import SmartEvseOutlet3
 
 from .polled_scene import ALL, LATER, PolledScene, as_write, play
+from .scene import MasterScene
 
 LIMIT = 10
 """Of the installation, A; the box has 16 A."""
@@ -326,3 +329,52 @@ def test_the_current_with_which_a_charge_begins(dialect: Dialect) -> None:
     scene = MaximumScene(dialect)
     assert scene.charger.begins_with is None
     play(scene, acts)
+
+
+# -- As a node of our master -------------------------------------------------------
+
+
+@pytest.mark.parametrize("plugged", [False, True])
+@pytest.mark.parametrize(
+    ("name", "opens"),
+    [
+        *((name, False) for name in ("2.17", "2.20", "2.30", "2.30+", "3", "3.00")),
+        *((name, True) for name in ("3", "3.00")),
+    ],
+)
+def test_a_node_keeps_its_access(name: str, *, plugged: bool, opens: bool) -> None:
+    """Turned off at the box; whether a 3.x opens it at such a write is not known."""
+
+    async def run() -> None:
+        scene = MasterScene(units=(), dialect=name)
+        box = scene.plug_box(2)
+        out = box.controller.outlet
+        if opens:
+            assert isinstance(out, SmartEvseOutlet3)
+            out.version = replace(out.version, settings_open_access=True)
+        scene.add(2)
+        async with scene:
+            slave = scene.slave(2)
+            await scene.until(lambda: bool(slave.settings))
+            out.set_access(False)
+            if plugged:
+                box.car.plug_in()
+            await asyncio.sleep(5)
+            written = flash_writes(out)
+            await slave.configure(Setting.MAXIMUM_CURRENT, LIMIT)
+            await slave.configure(Setting.MAXIMUM_CURRENT, LIMIT)
+            await asyncio.sleep(5)
+            assert not out.access
+            assert out.settings["max_current"] == LIMIT
+            assert sum(box.controller.eeprom_writes.values()) == 1
+            assert box.offers == 0
+            assert slave.begins_with is None
+            if not opens:
+                assert flash_writes(out) == written
+
+    simulate(run())
+
+
+def flash_writes(outlet: SmartEvseOutlet) -> int:
+    """Return how often a 3.x has stored its access."""
+    return outlet.flash_writes if isinstance(outlet, SmartEvseOutlet3) else 0
