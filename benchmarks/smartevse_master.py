@@ -77,17 +77,23 @@ SCENES: Final = (
     LATER,
     replace(LATER, name="2.30 to 3.x x7, one dead", dead=True),
 )
+PAIRS: Final = tuple(
+    MasterScene(f"{name} x2, set-points", dialects, TWO_17.supplies)
+    for name, dialects in (
+        ("2.17", ("2.17", "2.17")),
+        ("2.20", ("2.20", "2.20")),
+        ("2.30 to 3.x", ("2.30", "2.30+")),
+    )
+)
 MINUTES: Final = 10.0
 """Of each scene; one with a dead box takes a fifth of it."""
 SHORT: Final = 1 / 3
 SIMULATED: Final = 2 * HOUR
 SEED: Final = 3
-SUPPLY: Final = 32.0
 FOLLOWED: Final = 3.0
 """Time after which all boxes have their new share, s."""
 TOO_LONG: Final = 5.0
 """Longest time allowed without a broadcast, s."""
-SET_POINTS: Final = "set-points"
 
 
 async def run(
@@ -106,9 +112,10 @@ async def run(
     cases = [(one, HOUR / 6 if quick else SIMULATED) for one in alive]
     for some in await simulate_all(_simulated, cases):
         figures += some
-    if scene in SET_POINTS:
-        report("set-points")
-        figures += await _set_points(10 if quick else 100)
+    for two in PAIRS:
+        if scene in two.name:
+            report(two.name)
+            figures += await _set_points(two, 10 if quick else 60)
     return figures
 
 
@@ -281,10 +288,9 @@ def _given(prefix: str, seen: Seen) -> Figure:
 # -- Set-points ------------------------------------------------------------------
 
 
-async def _set_points(times: int) -> list[Figure]:
-    two = replace(TWO_17, dialects=TWO_17.dialects[:2])
+async def _set_points(two: MasterScene, times: int) -> list[Figure]:
     async with Oracle("smartevse", boxes=two.boxes(plugged=True)) as oracle:
-        bus = master_bus(oracle.url, two.units, SUPPLY)
+        bus = master_bus(oracle.url, two.units, two.supplies[0])
         await bus.start()
         try:
             await settled(bus)
@@ -297,9 +303,11 @@ async def _set_points(times: int) -> list[Figure]:
             await bus.stop()
         offers = await oracle.offers()
     return [
-        *set_point_figures(NAME, "", called, offers),
-        *_share_figures("one lowered to the other risen", freed, offers),
-        *_share_figures("one raised to its share offered", restored, offers),
+        *set_point_figures(NAME, f"{two.name}: ", called, offers),
+        *_share_figures(f"{two.name}: one lowered to the other risen", freed, offers),
+        *_share_figures(
+            f"{two.name}: one raised to its share offered", restored, offers
+        ),
     ]
 
 
