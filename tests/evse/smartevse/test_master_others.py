@@ -9,6 +9,7 @@ from custom_components.evse_bus.evse.errors import NotAvailableError, RefusedOrd
 from custom_components.evse_bus.evse.model import Circuit, Fault, OrderChange
 from custom_components.evse_bus.evse.scan import ScanResult
 from custom_components.evse_bus.evse.smartevse import MASTER
+from custom_components.evse_bus.evse.smartevse.dialects import Dialect
 from custom_components.evse_bus.evse.smartevse.master import (
     LISTENING,
     STAY_SILENT,
@@ -164,6 +165,25 @@ def test_nothing_is_written_to_boxes_of_two_families(dialect: str) -> None:
             await scene.until(scene.broadcasts)
             assert now() - begin >= LISTENING
             assert scene.master.noticed == set()
+
+    simulate(scene())
+
+
+@pytest.mark.parametrize("kept", [None, Dialect.V2_20])
+def test_nothing_is_written_before_all_were_read(kept: Dialect | None) -> None:
+    """Four boxes of 2.20 behind a slow adapter, and a last one with new firmware."""
+
+    async def scene() -> None:
+        async with MasterScene(
+            units=(2, 3, 4, 5, 6), dialect="2.20", kept=kept
+        ) as scene:
+            scene.plug_box(6, "2.30")
+            for unit in scene.units:
+                scene.box(unit).delay = 0.08
+            await scene.until(lambda: scene.master.noticed)
+            assert scene.master.noticed == {Fault.MIXED_DIALECTS}
+            await asyncio.sleep(20)
+            assert {sent.data[1] for sent in scene.line.sent} <= {3, 4}
 
     simulate(scene())
 

@@ -88,7 +88,7 @@ def test_a_car_is_granted_b_then_c_and_has_its_current_at_once(dialect: str) -> 
 @each
 def test_each_request_is_answered_within_a_round(dialect: str) -> None:
     async def scene() -> None:
-        async with scene_of(dialect, units=range(2, 9), limit=63.0) as scene:
+        async with scene_of(dialect, units=tuple(range(2, 9)), limit=63.0) as scene:
             await asyncio.sleep(10)
             for unit in scene.units:
                 scene.box(unit).car.plug_in()
@@ -516,7 +516,11 @@ KEPT = {
 def test_absent_nodes_are_asked_one_a_round_and_delay_nobody(dialect: str) -> None:
     async def scene() -> None:
         scene = scene_of(
-            dialect, units=range(2, 9), limit=32.0, kept=KEPT[dialect], current=16.0
+            dialect,
+            units=tuple(range(2, 9)),
+            limit=32.0,
+            kept=KEPT[dialect],
+            current=16.0,
         )
         async with scene:
             for unit in range(3, 9):

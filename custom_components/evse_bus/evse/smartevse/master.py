@@ -57,6 +57,8 @@ LISTENING: Final = 2.5
 """Time to listen for another master before our first broadcast, s."""
 READING: Final = 1.5
 """Longest time that the first broadcast waits for the slaves to be read, s."""
+READING_ALL: Final = 8.0
+"""The same where a broadcast might be for others than those that were not read yet, s."""
 STAY_SILENT: Final = 60.0
 """Silence after the last frame of another master, s."""
 STILL_CHARGING: Final = 8.0
@@ -569,12 +571,22 @@ class Master(BusMaster):
         self._read_units.clear()
         self._values = ()
 
+    @property
+    def _reading_time(self) -> float:
+        """Return the longest time for which the slaves are only read, s."""
+        if not self._slaves:
+            return 0.0
+        is_sure = all(slave.expected_dialect is not None for slave in self._slaves)
+        return (
+            READING if is_sure and Family.V2_20 not in self._families() else READING_ALL
+        )
+
     def _start_reading(self, now: float) -> None:
         """Read the slaves, then begin: there is no other master."""
         self.notice(Fault.SECOND_MASTER, present=False)
         self._phase = _Phase.READING
         self._read_units.clear()
-        self._wait(now + (READING if self.slaves else 0.0))
+        self._wait(now + self._reading_time)
 
     @override
     def on_unsolicited(self, frame: Frame) -> bool:
