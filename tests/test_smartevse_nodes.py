@@ -3,6 +3,8 @@
 from typing import Any
 
 from homeassistant.core import HomeAssistant
+from homeassistant.exceptions import HomeAssistantError
+from homeassistant.helpers import entity_registry as er
 import pytest
 from pytest_homeassistant_custom_component.common import MockConfigEntry
 
@@ -158,6 +160,55 @@ async def test_a_node_that_is_removed_while_it_charges_is_stopped(
         await bus.wait_for_async(lambda: bus.now() > until, timeout=100)
         assert not gone.contactor
         assert most_at_once(bus) <= 20
+
+
+# -- Access in the flash memory of a 3.x -------------------------------------------------
+
+
+@pytest.mark.usefixtures("all_entities_enabled")
+async def test_access_is_stored_in_a_3_x_on_request(hass: HomeAssistant) -> None:
+    boxes = nodes("3")
+    [box] = boxes
+    async with running(hass, *boxes, supply=SUPPLY) as (entry, bus):
+        await all_charge(hass, entry, boxes)
+        before = box.flash_writes
+        stored = await get_entity(hass, "switch", entry, "stored_access")
+        allowed = entity_id(hass, "switch", entry, "charging_allowed")
+        assert state_of(hass, stored) == "on"
+        for _ in range(2):
+            # Written once: it wears out.
+            await call(hass, "switch.turn_off", stored)
+            assert box.flash_writes == before + 1
+        await bus.wait_for_async(lambda: not box.contactor, timeout=10)
+        assert not box.access
+        await wait_for_state(hass, allowed, "off")
+        with pytest.raises(HomeAssistantError) as refused:
+            await call(hass, "switch.turn_on", allowed)
+        assert refused.value.translation_key == "smartevse_access_stored_off"
+        assert box.flash_writes == before + 1
+
+        await call(hass, "switch.turn_on", stored)
+        assert box.flash_writes == before + 2
+        await call(hass, "switch.turn_on", allowed)
+        await bus.wait_for_async(lambda: box.contactor, timeout=120)
+        assert box.flash_writes == before + 2
+
+
+async def test_stored_access_is_hidden_and_a_3_x_has_it_alone(
+    hass: HomeAssistant,
+) -> None:
+    boxes = nodes("2.30", "2.30+", "3")
+    async with running(hass, *boxes, supply=SUPPLY) as (entry, _):
+        for index in range(3):
+            await get_entity(hass, "sensor", entry, "1_status", index=index)
+        found = [
+            entity_id(hass, "switch", entry, "stored_access", index=index)
+            for index in range(3)
+        ]
+        assert found[:2] == [None, None]
+        registered = er.async_get(hass).async_get(found[2] or "")
+        assert registered is not None
+        assert registered.disabled_by is er.RegistryEntryDisabler.INTEGRATION
 
 
 # -- Boxes that need different masters ---------------------------------------------------

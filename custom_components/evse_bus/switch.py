@@ -84,6 +84,18 @@ COMMANDS: Final[tuple[CommandSwitchDescription, ...]] = (
         command=Command.SET_ENABLE_AFTER_POWER_CYCLE,
         value=_option("enable_after_power_cycle"),
     ),
+    CommandSwitchDescription(
+        key="stored_access",
+        translation_key="stored_access",
+        entity_category=EntityCategory.CONFIG,
+        # Each change wears out the memory of the box: for people, not for automations.
+        entity_registry_enabled_default=False,
+        capability=Capability.STORED_ACCESS,
+        command=Command.STORE_ACCESS,
+        value=lambda charger: (
+            None if charger.reading is None else charger.reading.allowed
+        ),
+    ),
 )
 
 

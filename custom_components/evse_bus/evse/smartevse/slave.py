@@ -27,6 +27,7 @@ from ..modbus import ModbusFrame
 from ..model import (
     MINIMUM_CURRENT,
     Capability,
+    Command,
     FailSafe,
     Fault,
     Limits,
@@ -166,7 +167,11 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Member):
     @override
     def capabilities(self) -> frozenset[Capability]:
         # The mode of a slave is its master's.
-        return super().capabilities - {Capability.MODE}
+        known = super().capabilities - {Capability.MODE}
+        habits = self._habits
+        if habits is not None and not habits.access_is_volatile:
+            known |= {Capability.STORED_ACCESS}
+        return known
 
     @property
     @override
@@ -566,6 +571,17 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Member):
         message = f"{self.config.name} does not follow its limit"
         raise NotConfirmedError(message)
 
+    @override
+    async def command(
+        self,
+        command: Command,
+        value: bool | int | str | None = None,
+    ) -> None:
+        if command is Command.STORE_ACCESS:
+            await self.store_access(bool(value))
+        else:
+            await super().command(command, value)
+
     async def store_access(self, allowed: bool) -> None:  # noqa: FBT001
         """Turn its access on or off in its own memory; return when it is read back.
 
@@ -576,7 +592,13 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Member):
         if self._habits is None or self._has_volatile_access:
             message = f"{self.config.name} does not keep its access"
             raise NotAvailableError(message)
-        await self.run(partial(self.set_access, allowed=allowed))
+        if self.has_access is not allowed:
+            await self.run(partial(self.set_access, allowed=allowed))
+
+    @property
+    def has_access(self) -> bool | None:
+        """Return its access in the last status; ``None``: not known."""
+        return None if self.status is None else self.status.access
 
     @override
     async def on_shutdown(self, *, removed: bool = False) -> None:
