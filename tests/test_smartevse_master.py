@@ -352,10 +352,10 @@ async def test_the_issue_of_another_master_goes_with_the_bus(
 
 async def test_a_slave_of_a_later_firmware(hass: HomeAssistant) -> None:
     box = SmartEvse("2.30+", load_balance=2)
-    async with running(hass, box, supply=SUPPLY) as (entry, _):
+    async with running(hass, box, supply=SUPPLY) as (entry, bus):
         limit = entity_id(hass, "number", entry, "charging_current")
         await wait_until(hass, lambda: state_of(hass, limit) != "unavailable")
         problem = await get_entity(hass, "binary_sensor", entry, "problem")
         await wait_for_state(hass, problem, "off")
-        await wait_until(hass, lambda: box.broadcasts)
+        await bus.wait_for_async(lambda: box.broadcasts)
         assert not box.writes

@@ -4,9 +4,10 @@ from typing import Any
 
 from homeassistant.core import HomeAssistant
 from homeassistant.exceptions import HomeAssistantError
-from homeassistant.helpers import entity_registry as er
+from homeassistant.helpers import device_registry as dr, entity_registry as er
 import pytest
 from pytest_homeassistant_custom_component.common import MockConfigEntry
+from syrupy.assertion import SnapshotAssertion
 
 from custom_components.evse_bus.diagnostics import async_get_config_entry_diagnostics
 from tests.common import (
@@ -21,8 +22,10 @@ from tests.common import (
     wait_for_state,
     wait_until,
 )
+from tests.entity_table import device_table, entity_table
 from tests.smartevse import car, shorten
 from tests.test_coordinator import issue
+from tests.test_entities import UNSTEADY
 from tests.test_smartevse_master import SUPPLY, both_charge, bus_entity
 from tests.virtual import SmartEvse, VirtualBus, smartevse_requests_in
 
@@ -160,6 +163,50 @@ async def test_a_node_that_is_removed_while_it_charges_is_stopped(
         await bus.wait_for_async(lambda: bus.now() > until, timeout=100)
         assert not gone.contactor
         assert most_at_once(bus) <= 20
+
+
+async def test_an_unloaded_bus_leaves_no_box_that_goes_on_for_ever(
+    hass: HomeAssistant, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The others stop by themselves; a reload must not stop them."""
+    proven, unproven = boxes = nodes("2.30", "3.6")
+    async with running(hass, *boxes, supply=SUPPLY) as (entry, bus):
+        await all_charge(hass, entry, boxes)
+        assert await hass.config_entries.async_unload(entry.entry_id)
+        assert not unproven.pilot_current
+        assert proven.contactor
+        await bus.wait_for_async(lambda: not unproven.contactor, timeout=10)
+        await bus.wait_for_async(lambda: not proven.contactor, timeout=12)
+        until = bus.now() + 60
+        await bus.wait_for_async(lambda: bus.now() > until, timeout=70)
+        assert not unproven.contactor
+        assert unproven.access
+    assert "failed" not in caplog.text
+
+
+@pytest.mark.usefixtures("all_entities_enabled")
+async def test_entities_and_devices_of_nodes(
+    hass: HomeAssistant, snapshot: SnapshotAssertion
+) -> None:
+    boxes = nodes("2.30", "3.6", "3")
+    async with running(hass, *boxes, supply=SUPPLY, poll_interval=2) as (entry, _):
+        for index in range(3):
+            limit = await get_entity(
+                hass, "number", entry, "setting_maximum_current", index=index
+            )
+            await wait_for_state(hass, limit, "16")
+        await hass.async_block_till_done()
+        shown = [
+            one
+            for one in er.async_entries_for_config_entry(
+                er.async_get(hass), entry.entry_id
+            )
+            if one.config_subentry_id == list(entry.subentries)[1]
+        ]
+        assert entity_table(hass, shown, UNSTEADY) == snapshot
+        registry = dr.async_get(hass)
+        devices = dr.async_entries_for_config_entry(registry, entry.entry_id)
+        assert device_table(devices) == snapshot
 
 
 # -- Access in the flash memory of a 3.x -------------------------------------------------

@@ -99,6 +99,7 @@ async def async_unload_entry(hass: HomeAssistant, entry: EvseBusConfigEntry) -> 
     """Unload a config entry: the chargers' own fail-safe takes over."""
     unloaded = await hass.config_entries.async_unload_platforms(entry, PLATFORMS)
     if unloaded:
+        await entry.runtime_data.all_chargers.async_stop_unproven()
         await entry.runtime_data.async_stop()
     return unloaded
 

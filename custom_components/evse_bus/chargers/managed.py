@@ -122,12 +122,16 @@ class ManagedCharger:
 
 
 async def async_shut_down_chargers(
-    chargers: Sequence[Charger], *, removed: bool = False
+    chargers: Sequence[Charger],
+    *,
+    removed: bool = False,
+    why: str = "Home Assistant stops",
 ) -> None:
     """Send each charger its configured shutdown command, if any; raises nothing.
 
-    ``removed``: these chargers are removed while Home Assistant keeps running. The
-    orders stay as they are: a shutdown command is not an order of the user.
+    ``removed``: these chargers are removed while Home Assistant keeps running; else
+    ``why``: for the log. The orders stay as they are: a shutdown command is not an order
+    of the user.
     """
     results = await asyncio.gather(
         *(_async_shut_down(charger, removed) for charger in chargers),
@@ -138,7 +142,7 @@ async def async_shut_down_chargers(
             LOGGER.error(
                 "The shutdown command to %s failed (%s): %s",
                 charger.config.name,
-                "it is removed" if removed else "Home Assistant stops",
+                "it is removed" if removed else why,
                 result if isinstance(result, EvseError) else repr(result),
             )
 

@@ -35,7 +35,7 @@ from ..const import (
 )
 from ..discovery import async_set_up_now
 from ..energy import TOTALS
-from ..evse.model import ChargerConfig, Fault, Orders
+from ..evse.model import ChargerConfig, FailSafe, Fault, Orders
 from ..evse.safety import cautious
 from ..identity import Holder, holders, identity_of, older_holder, stands_on_serial
 from ..issues import BusIssues
@@ -104,6 +104,14 @@ class BusChargers:
     async def async_shut_down(self) -> None:
         """Send all shutdown commands, when Home Assistant stops."""
         await async_shut_down_chargers([one.charger for one in self.all.values()])
+
+    async def async_stop_unproven(self) -> None:
+        """Stop the chargers that might go on for ever when no message comes."""
+        chargers = [one.charger for one in self.all.values()]
+        await async_shut_down_chargers(
+            [one for one in chargers if one.fail_safe is FailSafe.UNPROVEN],
+            why="its bus is unloaded",
+        )
 
     async def async_stop(self) -> None:
         """Close the connections, end all subscriptions and write pending orders."""

@@ -75,7 +75,7 @@ POLLED: Final = Protocol(
 
 MASTER: Final = Protocol(
     key="smartevse_master",
-    name="SmartEVSE v2, load balancing",
+    name="SmartEVSE, load balancing",
     make=_MAKE,
     choice="master",
     settings=SETTINGS,

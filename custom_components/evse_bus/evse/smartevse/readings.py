@@ -32,7 +32,7 @@ _FIRMWARE: Final = {
     Dialect.V2_20: "2.20",
     Dialect.V2_30: "2.30",
     Dialect.V2_HEAD: "2.30, development version",
-    Dialect.V3_OLD: "3.x, up to 3.7 or so",
+    Dialect.V3_OLD: "3.x, before November 2025",
     Dialect.V3: "3.x",
 }
 
