@@ -91,7 +91,7 @@ async def test_slave_is_added_to_a_bus_that_runs(hass: HomeAssistant) -> None:
         assert flow.tells("firmware 2.17 at Slave 2")
         await flow.submit(charger("New", 13))
         assert flow.step == "confirm_smartevse_master"
-        assert flow.tells("allowed 20 A per phase", "for 10 s")
+        assert flow.tells("allowed 20 A per phase", "12 s at most")
         await flow.submit()
         assert flow.result["type"] is FlowResultType.CREATE_ENTRY
         await hass.async_block_till_done()

@@ -306,6 +306,27 @@ def test_the_write_waits_for_the_quiet(dialect: Dialect) -> None:
 
 
 @each
+def test_what_is_urgent_does_not_wait_for_it(dialect: Dialect) -> None:
+    """A power failure opens access that was off; the write waits for its quiet then."""
+
+    async def acts(scene: MaximumScene) -> None:
+        await scene.begin(Before.OFF_WITH_CAR)
+        # The burst of the last poll is over: a later box has its quiet.
+        await asyncio.sleep(1.5)
+        lowered = asyncio.create_task(scene.lower())
+        await asyncio.sleep(0.1)
+        scene.box.controller.power_cycle()
+        opened = now()
+        await scene.until(lambda: not scene.outlet.access, 60)
+        assert now() - opened < 8
+        await asyncio.wait({lowered})
+        await scene.polled(3)
+        assert not scene.outlet.access
+
+    play(MaximumScene(dialect, allowed=False), acts)
+
+
+@each
 def test_a_box_that_refuses_it(dialect: Dialect) -> None:
     async def acts(scene: MaximumScene) -> None:
         scene.box.misses = lambda data: (

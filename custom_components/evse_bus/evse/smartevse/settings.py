@@ -56,9 +56,10 @@ async def _set(
 ) -> None:
     """Write the highest of the accepted values, unless one of them stands."""
     value = accepted[-1]
+    if (quiet := reader.minimum_pause(turn.now)) > 0:
+        # Not counted as a conversation: what is urgent goes first.
+        await rest(quiet)
     with reader.conversing():
-        if (quiet := reader.minimum_pause(turn.now)) > 0:
-            await rest(quiet)
         await reader.reach(turn)
         await reader.read_status(turn)
         await rest()
