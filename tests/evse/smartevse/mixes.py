@@ -160,6 +160,7 @@ class MixScene(MasterScene):
     damaged: bool = False
     """Replies are damaged on their way."""
     watched: dict[int, Watch] = field(init=False, default_factory=dict)
+    found: dict[int, KeptDialect] = field(init=False, default_factory=dict)
     excused: Counter[str] = field(init=False, default_factory=Counter)
     """Reasons why more than the supply was no fault, and for how many steps."""
     wrong: list[str] = field(init=False, default_factory=list)
@@ -183,14 +184,19 @@ class MixScene(MasterScene):
             name=f"slave {unit}",
             address=unit,
             installation_limit=INSTALLATION,
-            dialect=KEPT[spec.dialect] if spec.kept else None,
+            dialect=self.found.get(unit, KEPT[spec.dialect] if spec.kept else None),
         )
         usual = {"limit": CurrentLimit(current=self.current), "allowed": self.allowed}
         return SlaveSmartEvse(config, Orders(**(usual | orders)))  # type: ignore[arg-type]
 
     async def restart(self, *, reload: bool) -> None:
         """Restart the library, which has stored its orders; the boxes go on."""
-        orders = {unit: self.slave(unit).orders for unit in self.units}
+        slaves = [self.slave(unit) for unit in self.units]
+        orders = {slave.unit: slave.orders for slave in slaves}
+        for slave in slaves:
+            if slave.dialect is not None:
+                # It is kept with the charger.
+                self.found[slave.unit] = slave.dialect
         await self.bus.stop()
         self.new_bus(reload=reload)
         for unit, one in orders.items():

@@ -12,7 +12,7 @@ import os
 from random import Random
 from typing import Any
 
-from hypothesis import HealthCheck, event, given, settings, strategies as st
+from hypothesis import HealthCheck, Phase, event, given, settings, strategies as st
 
 from custom_components.evse_bus.evse.errors import EvseError
 from custom_components.evse_bus.evse.model import OrderChange
@@ -21,6 +21,8 @@ from tests.simulated_time import now, simulate
 from tests.virtual import Car
 
 EXAMPLES = int(os.environ.get("SUPPLY_EXAMPLES", "6"))
+PHASES = tuple(set(Phase) - {Phase.explain})
+"""To explain a failure would take minutes."""
 SEATS = 7
 """Most boxes of one master; a story names them by their place."""
 HEALTHY = 10.0
@@ -200,7 +202,7 @@ def check(
 
 
 @settings(
-    max_examples=EXAMPLES, suppress_health_check=[HealthCheck.too_slow], deadline=None
+    max_examples=EXAMPLES, suppress_health_check=[HealthCheck.too_slow], phases=PHASES
 )
 @given(
     mix=st.sampled_from(tuple(FAMILIES)).flatmap(
@@ -218,7 +220,9 @@ def test_any_mix_keeps_to_the_supply(
     check(family, boxes, limit, story, seed)
 
 
-@settings(max_examples=EXAMPLES, suppress_health_check=[HealthCheck.too_slow])
+@settings(
+    max_examples=EXAMPLES, suppress_health_check=[HealthCheck.too_slow], phases=PHASES
+)
 @given(
     families=st.permutations(tuple(FAMILIES)).map(lambda some: some[:2]),
     data=st.data(),
