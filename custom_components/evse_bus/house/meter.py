@@ -43,8 +43,9 @@ class Silence(StrEnum):
 class Rhythm:
     """The reports of one sensor in time."""
 
-    def __init__(self) -> None:
-        """Know nothing; the first report is one from now on."""
+    def __init__(self, silence: float = SILENCE) -> None:
+        """Know nothing; after ``silence``, s, without a report it is silent."""
+        self._silence = silence
         self.last: float | None = None
         """Time of the last report."""
         self._gaps: deque[float] = deque(maxlen=_GAPS)
@@ -61,7 +62,7 @@ class Rhythm:
     @property
     def patience(self) -> float:
         """Return the time after which it counts as silent, s."""
-        return max(SILENCE, PERIODS * (self.period or 0.0))
+        return max(self._silence, PERIODS * (self.period or 0.0))
 
     def take(self, at: float, now: float) -> float | None:
         """Return the time that this report stands for, s; ``None``: it is none.
