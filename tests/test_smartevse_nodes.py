@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from homeassistant.const import EVENT_HOMEASSISTANT_STOP
 from homeassistant.core import HomeAssistant
 from homeassistant.exceptions import HomeAssistantError
 from homeassistant.helpers import device_registry as dr, entity_registry as er
@@ -23,6 +24,7 @@ from tests.common import (
     wait_until,
 )
 from tests.entity_table import device_table, entity_table
+from tests.flow import Flow
 from tests.smartevse import car, shorten
 from tests.test_coordinator import issue
 from tests.test_entities import UNSTEADY
@@ -165,14 +167,21 @@ async def test_a_node_that_is_removed_while_it_charges_is_stopped(
         assert most_at_once(bus) <= 20
 
 
-async def test_an_unloaded_bus_leaves_no_box_that_goes_on_for_ever(
-    hass: HomeAssistant, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize("unloaded", [True, False])
+async def test_no_box_is_left_behind_that_goes_on_for_ever(
+    hass: HomeAssistant,
+    caplog: pytest.LogCaptureFixture,
+    unloaded: bool,  # noqa: FBT001
 ) -> None:
     """The others stop by themselves; a reload must not stop them."""
     proven, unproven = boxes = nodes("2.30", "3.6")
     async with running(hass, *boxes, supply=SUPPLY) as (entry, bus):
         await all_charge(hass, entry, boxes)
-        assert await hass.config_entries.async_unload(entry.entry_id)
+        if unloaded:
+            assert await hass.config_entries.async_unload(entry.entry_id)
+        else:
+            hass.bus.async_fire(EVENT_HOMEASSISTANT_STOP)
+            await hass.async_block_till_done()
         assert not unproven.pilot_current
         assert proven.contactor
         await bus.wait_for_async(lambda: not unproven.contactor, timeout=10)
@@ -182,6 +191,37 @@ async def test_an_unloaded_bus_leaves_no_box_that_goes_on_for_ever(
         assert not unproven.contactor
         assert unproven.access
     assert "failed" not in caplog.text
+
+
+async def test_a_node_whose_address_is_changed_is_stopped_at_the_old_one(
+    hass: HomeAssistant,
+) -> None:
+    """Here alone: the box keeps its number, and nothing answers at the new one."""
+    boxes = nodes("2.30", "3")
+    async with running(hass, *boxes, supply=SUPPLY) as (entry, bus):
+        await all_charge(hass, entry, boxes)
+        await bus.wait_for_async(lambda: offered(boxes) == [10, 10], timeout=60)
+        stored = boxes[1].flash_writes
+        moved = list(entry.subentries.values())[1]
+        flow = await Flow.change_settings(hass, entry, moved)
+        typed = {
+            "name": moved.title,
+            "slave": "7",
+            "installation_limit": 16,
+            "expert": {"poll_interval": 2, "voltage": 230},
+        }
+        await flow.submit(typed)
+        assert moved.data["address"] == 7
+        assert moved.data["dialect"] == "3.x"
+        await bus.wait_for_async(lambda: not boxes[1].contactor, timeout=15)
+        assert boxes[1].flash_writes == stored
+        await bus.wait_for_async(lambda: offered(boxes) == [16, 0], timeout=60)
+
+        # Back again: it charges as before.
+        flow = await Flow.change_settings(hass, entry, moved)
+        await flow.submit({**typed, "slave": "5"})
+        await bus.wait_for_async(lambda: offered(boxes) == [10, 10], timeout=200)
+        assert most_at_once(bus) <= 20
 
 
 @pytest.mark.usefixtures("all_entities_enabled")

@@ -107,6 +107,9 @@ class BusChargers:
 
     async def async_stop_unproven(self) -> None:
         """Stop the chargers that might go on for ever when no message comes."""
+        if self._stopped:
+            # With Home Assistant, which has sent all shutdown commands.
+            return
         chargers = [one.charger for one in self.all.values()]
         await async_shut_down_chargers(
             [one for one in chargers if one.fail_safe is FailSafe.UNPROVEN],
