@@ -264,7 +264,12 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         inputs = (self.valid_orders, self.effective_orders, self.limits)
         if self._reason is None or self._reason[0] != inputs:
             self._reason = (inputs, _reason_of(*inputs))
-        return self._reason[1] or self.hindrance
+        waits = self.governance.unproved is not None and self.may_be_paused
+        return (
+            self._reason[1]
+            or self.hindrance
+            or (PauseReason.WAITS_FOR_USER if waits else None)
+        )
 
     @property
     def hindrance(self) -> PauseReason | None:
@@ -767,9 +772,18 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         return self.waits_for_current
 
     @property
+    def may_be_paused(self) -> bool:
+        """Return whether a pause may stand at the box, whoever has sent it."""
+        return self.reading is not None and self.reading.allowed is not True
+
+    @property
     def visit(self) -> str | None:
         """Return what proves, after a restart, that the same car is still there."""
         return None
+
+    def continues(self, pause: CeilingPause) -> bool:  # noqa: ARG002
+        """Return whether box and visit are provably those of a pause noted before."""
+        return False
 
     @property
     def serial_read(self) -> str | None:
@@ -782,15 +796,15 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         if governance.ceiling is None or not self.available or self.reading is None:
             return
         if governance.unproved is not None:
-            if self.reading.allowed is False and not self.holds_ceiling_pause:
+            if self.may_be_paused and not self.holds_ceiling_pause:
                 return
             # There is no pause any more, or it has been proved to be ours.
             governance.unproved = None
         noted = self.orders.remembered.get(PAUSED_BY_CEILING)
-        note = None
-        if self.holds_ceiling_pause:
-            note = noted
-            if self.is_paused_by_ceiling and note is None:
+        note = noted if self.holds_ceiling_pause else None
+        if self.holds_ceiling_pause and self.is_paused_by_ceiling:
+            known = None if noted is None else CeilingPause.from_note(noted)
+            if known is None or (self.visit is not None and not self.continues(known)):
                 note = CeilingPause(self.serial_read, self.visit).note
         await self.remember(PAUSED_BY_CEILING, note)
 

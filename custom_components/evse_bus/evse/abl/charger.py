@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final, override
 
+from ..ceiling import CeilingPause
 from ..collisions import Collisions
 from ..conversation import Conversation, FollowUp
 from ..errors import GarbledReplyError, NotAvailableError, ReplyTimeoutError
@@ -275,6 +276,7 @@ class AblCharger(AblWriter):
                 return
             failed = self.box.writes.failed(self.code, turn.now)
             was_paused = decision.paused is True
+            was_open = self.box.is_open(turn.now)
             await self.apply_setpoint(
                 turn,
                 lambda: self.setpoint,
@@ -282,8 +284,67 @@ class AblCharger(AblWriter):
             )
             by_limit = self.effective_orders.allowed is not False
             # The orders may have changed since.
-            if self.box.writes.code == PAUSE and by_limit and not was_paused:
+            if self.box.writes.code != PAUSE or not by_limit:
+                return
+            if self.is_paused_by_ceiling:
+                await self._note_ceiling_pause(was_open=was_open)
+            elif not was_paused:
                 await self.note_pause(by_limit=True)
+
+    # -- The ceiling ---------------------------------------------------------------
+
+    @override
+    async def follow_ceiling(self, turn: Turn) -> None:
+        # A limit alone is written: no state that wakes a car or enables the outlet.
+        with self.conversing():
+            await self.identify(turn)
+            await self.read_status(turn)
+            await self._require_icmax(turn)
+            was_open = self.box.is_open(turn.now)
+            ends_pause = self._ends_ceiling_pause
+            if not self._may_follow(turn.now, ends_pause=ends_pause):
+                return
+            await self.apply_setpoint(turn, lambda: self.setpoint, starts=ends_pause)
+            if self.box.writes.code != PAUSE:
+                await self.note_pause(by_limit=False)
+            elif self.is_paused_by_ceiling:
+                await self._note_ceiling_pause(was_open=was_open)
+
+    @property
+    def _ends_ceiling_pause(self) -> bool:
+        """Return whether a higher ceiling ends the pause that stands.
+
+        Expired orders that are a pause by themselves are none of the ceiling's.
+        """
+        ordered = clamp(self.orders, self.limits)
+        return self.paused_by_our_limit and not ordered.paused
+
+    def _may_follow(self, now: float, *, ends_pause: bool) -> bool:
+        """Return whether the ceiling is written in the status just read."""
+        box = self.box
+        order = replace(
+            self.standing(now),
+            raised=True,
+            ends_pause=ends_pause,
+            after_pause=box.writes.code == PAUSE,
+        )
+        decision = box.decide(order, now)
+        if decision is None or decision.state is None:
+            # Sent when the failure or the set-up is over.
+            box.raised = True
+            return False
+        if order.code == PAUSE:
+            return decision.write or decision.state is not OrderState.CONFIRMED
+        box.raised = not decision.write
+        return decision.write
+
+    async def _note_ceiling_pause(self, *, was_open: bool) -> None:
+        """Note a pause that was sent; ours if no other stood before it."""
+        if was_open or self.paused_by_our_limit:
+            await self.note_pause(by_limit=True)
+        elif self.box.paused is None:
+            # It may have been paused by another: the user knows.
+            self.governance.unproved = CeilingPause(self.serial, None)
 
     # -- Commands ----------------------------------------------------------------
 

@@ -198,6 +198,16 @@ class BoxEvidence:
         seen = self.seen(self.status_at)
         return None if seen is None else believed_paused(seen)
 
+    def is_open(self, now: float) -> bool:
+        """Return whether what was read shows that no pause stands."""
+        seen = self.seen(now)
+        if seen is None:
+            return False
+        paused = believed_paused(seen)
+        # In C no pause stands; else a pause that cannot be read may be another's.
+        is_known = seen.charging or self.allowed_by_user
+        return paused is False or (paused is None and is_known)
+
     def note_confirmed(self, code: int) -> None:
         """Take note that the registers show an order."""
         if code != PAUSE:

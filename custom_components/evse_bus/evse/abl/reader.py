@@ -548,7 +548,8 @@ class AblReader(Charger[AblConfig]):
         """
         noted = self.orders.remembered.get(PAUSED_BY_LIMIT)
         proved = noted is not None and noted == self.serial and self.box.paused is True
-        return self.limit_paused or proved
+        # A pause by a ceiling needs more: the same car (`CeilingPause`).
+        return self.limit_paused or (proved and self.governance.unproved is None)
 
     async def note_pause(self, *, by_limit: bool) -> None:
         """Note who has paused the box, also for the time after a restart."""

@@ -302,8 +302,13 @@ class EvboxCharger(Charger[EvboxConfig]):
 
     @property
     @override
-    def holds_ceiling_pause(self) -> bool:
+    def may_be_paused(self) -> bool:
         # Its pause is in our set-point alone: nobody else can pause it.
+        return False
+
+    @property
+    @override
+    def holds_ceiling_pause(self) -> bool:
         confirmed = self._confirmed
         return confirmed is not None and confirmed.paused and self._permitted.paused
 

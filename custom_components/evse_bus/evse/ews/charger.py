@@ -155,6 +155,32 @@ class EwsPort(EwsReader):
                 for_current=change.allowed is not True,
             )
 
+    @override
+    async def follow_ceiling(self, turn: Turn) -> None:
+        with self.conversing():
+            await self.ready(turn)
+            if self.setpoint.paused:
+                allowed = self.effective_orders.allowed is not False
+                await self.permission.pause(turn, for_current=allowed)
+                return
+            await self.limiter.enforce(turn, lambda: self.effective_orders)
+            if not self._may_resume:
+                return
+            await rest(0.0)
+            await self.permission.start(
+                turn, lambda: self._may_resume, for_current=True
+            )
+
+    @property
+    def _may_resume(self) -> bool:
+        """Return whether a higher ceiling ends a pause, or a wait for current.
+
+        Expired orders that are a pause by themselves are none of the ceiling's.
+        """
+        ordered = clamp(self.orders, self.limits)
+        paused = ordered.paused or self.setpoint.paused
+        return self.permission.waits_for_current and not paused
+
     def _is_pause(self, change: OrderChange) -> bool:
         return clamp(self.order_to_send(change), self.limits).paused
 

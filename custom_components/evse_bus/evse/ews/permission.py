@@ -211,6 +211,13 @@ class Permission:
         """Take note that the port is out of sight: another car may come unnoticed."""
         self._withheld_in = None
 
+    def adopt_pause(self) -> None:
+        """Take note that the pause of a ceiling in an earlier run is proved to stand."""
+        tracker = self._tracker
+        if tracker.pause is Pause.POSSIBLE:
+            tracker.pause = Pause.OURS
+            tracker.for_current = True
+
     def withhold_start(self) -> None:
         """Take note that the user allows a charge for which the limit is too low."""
         status = self._port.last_status

@@ -4,12 +4,13 @@ from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import Final, override
 
+from ..ceiling import CeilingPause
 from ..events import ChargeStarted, Event, EventListener, port_of
 from ..model import Capability, FailSafe, Fault, Limits, Orders, PauseReason
 from .config import EwsPortConfig
 from .events import charge_ended, start_requested
 from .limit import Limiter
-from .permission import Permission
+from .permission import Pause, Permission
 from .port import BoxPort
 from .readings import (
     asks_for_start,
@@ -19,11 +20,22 @@ from .readings import (
     limits_of,
 )
 from .wire.parameters import SystemMode
-from .wire.states import RUNNING
+from .wire.states import AFTER_OUR_PAUSE, RUNNING
 from .wire.status import PortStatus
 
 IMPLAUSIBLE_REPLIES: Final = 3
 """Implausible replies in a row after which older readings no longer count."""
+
+
+def _counted(status: PortStatus) -> tuple[int, ...]:
+    """Return what changes with each charge, and does not in a pause of one."""
+    return (
+        status.state,
+        status.session_energy,
+        status.total_energy,
+        status.last_time,
+        status.last_energy,
+    )
 
 
 class EwsReader(BoxPort):
@@ -107,6 +119,38 @@ class EwsReader(BoxPort):
         super().on_line_open()
         self.limiter.forget()
 
+    # -- Its visit -------------------------------------------------------------------
+
+    @property
+    @override
+    def may_be_paused(self) -> bool:
+        status, pause = self.last_status, self.permission.pause_state
+        is_pause = status is not None and status.state in AFTER_OUR_PAUSE
+        return is_pause and pause is not Pause.NONE
+
+    @property
+    @override
+    def visit(self) -> str | None:
+        status = self.last_status
+        if status is None or not status.session_energy:
+            # Another visit without energy would look the same.
+            return None
+        return " ".join(map(str, (status.session_time, *_counted(status))))
+
+    @override
+    def continues(self, pause: CeilingPause) -> bool:
+        status, box = self.last_status, self.box.status
+        if status is None or box is None or pause.visit is None:
+            return False
+        # Nothing flows in a pause, and each other charge would be counted.
+        begun, _, counted = pause.visit.partition(" ")
+        return (
+            pause.serial == box.serial
+            and counted == " ".join(map(str, _counted(status)))
+            and begun.isdecimal()
+            and status.session_time >= int(begun)
+        )
+
     # -- Its reading -----------------------------------------------------------------
 
     @override
@@ -117,6 +161,9 @@ class EwsReader(BoxPort):
             # Its restart flag may stay set for long: no proof that the pause is over.
             self.permission.doubt()
         self.permission.on_status(status)
+        unproved = self.governance.unproved
+        if unproved is not None and self.continues(unproved):
+            self.permission.adopt_pause()
         self._publish_events(before, status)
         self._implausible = 0
         self.notice(Fault.IMPLAUSIBLE, present=False)

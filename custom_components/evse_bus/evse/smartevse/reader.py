@@ -99,6 +99,8 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
         """Pending cleanup: writing a setting may have opened access that was off."""
         self._serial: str | None = None
         self._plug = PlugWatch()
+        self._closed_by_us = False
+        """We have turned its access off, and nothing but the driver turns it on."""
         self._temperature: int | None = None
         """The last temperature that it has measured, degrees Celsius."""
         self._implausible_replies = 0
@@ -158,12 +160,15 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
         self.configuration = None
         self.configuration_due = 0.0
         self._temperature = None
+        self._closed_by_us = False
 
     @override
     def on_missed(self, now: float, why: str) -> None:
         super().on_missed(now, why)
         # The next reply may be another box's: read it before anything is written.
         self.status = None
+        # A power failure opens access, too.
+        self._closed_by_us = False
         # Or it was switched off and on again.
         self._temperature = None
         self._plug.missed()
@@ -315,6 +320,7 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
         plugged = self._plug.see(
             dialect, status, now, may_be_refused=self._may_be_refused(status)
         )
+        self._note_driver(status, plugged=plugged)
         status = self._with_measured_temperature(status)
         self.status = status
         reading = charger_reading(
@@ -353,6 +359,24 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
             status = replace(status, temperature=None)
         self._temperature = status.temperature
         return status
+
+    def _note_driver(self, status: Status, *, plugged: bool | None) -> None:
+        """Note access that was opened at the box during a pause by a ceiling.
+
+        It is the driver's word for this visit. (An "off" at the box during our pause
+        cannot be told from it.)
+        """
+        if status.access is True:
+            # A power failure opens it, too, and so may the write of a setting.
+            before = self.status
+            restarted = before is not None and has_restarted(before, status)
+            other = self.must_close_access or restarted
+            opened = self._closed_by_us and not other
+            self._closed_by_us = False
+            if opened and self.waits_for_current and self.is_paused_by_ceiling:
+                self.governance.driver_allows = True
+        if plugged is False:
+            self.governance.driver_allows = False
 
     # -- Configuration -------------------------------------------------------------
 
@@ -401,6 +425,7 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
             if not still_wanted():
                 message = "a newer command came first"
                 raise SupersededError(message)
+            self._closed_by_us = False
             return write_access(self.config.address, dialect, allowed)
 
         for _ in range(WRITES):
@@ -412,6 +437,7 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
                 await rest(pause)
                 await self.read_status(turn)
                 if self._has_access(allowed):
+                    self._closed_by_us = self.has_access is False
                     return
             await rest()
         state = "on" if allowed else "off"
@@ -425,6 +451,11 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
             await rest()
             await self.set_access(turn, allowed=False)
         self.must_close_access = False
+
+    @property
+    def has_access(self) -> bool | None:
+        """Return its access bit by the last status; ``None``: not known."""
+        return None if self.status is None else self.status.access
 
     def _has_access(self, allowed: bool) -> bool:  # noqa: FBT001
         """Return whether the last status confirms that access is on, or off."""

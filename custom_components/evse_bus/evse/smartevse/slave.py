@@ -250,6 +250,14 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Member):
 
     @property
     @override
+    def holds_ceiling_pause(self) -> bool:
+        if self._has_volatile_access:
+            return self._paused_by_us
+        # Access in flash memory is not written: the pause is in our broadcasts alone.
+        return self._is_paused
+
+    @property
+    @override
     def pause_reason(self) -> PauseReason | None:
         withheld = PauseReason.SUPPLY_TOO_LOW if self.withheld else None
         return super().pause_reason or withheld
