@@ -17,6 +17,7 @@ from . import (
     ews_listener,
     ews_poll,
     exchange_cpu,
+    fuse,
     home_assistant,
     hostile_bytes,
     set_value,
@@ -46,6 +47,7 @@ BENCHMARKS: Final = {
         adapter_away,
         slow_lines,
         hostile_bytes,
+        fuse,
         sun,
     )
 }

@@ -29,6 +29,9 @@ from benchmarks.ews_events import Occurrence, delays, reported_by
 from benchmarks.ews_listener import _Window, period_figures
 from benchmarks.ews_poll import IDEAL, RC, polls
 from benchmarks.figures import Figure, gaps, percentile, results, table
+from benchmarks.fuse import cases, controller
+from benchmarks.fuse_house import DAY, house
+from benchmarks.fuse_plant import Outcome, run as run_house
 from benchmarks.house_boxes import box_entry
 from benchmarks.house_commands import add_entry
 from benchmarks.offers import Offer
@@ -458,3 +461,25 @@ def test_many_boxes_are_many_buses() -> None:
         "ews-000000000002",
         "ews-000000000003",
     ]
+
+
+def test_the_winter_house_alone_is_seldom_above_its_fuse() -> None:
+    trace = house(10)
+    above = sum(max(one) > 25 for one in zip(*trace.phases, strict=True))
+    assert 35 <= above / 10 <= 47
+    assert house(1).phases == tuple(phase[:DAY] for phase in trace.phases)
+
+
+def test_seconds_above_the_fuse_are_counted() -> None:
+    outcome = Outcome(1)
+    for current in (26, 32, 32, 25, 26):
+        outcome.count(current)
+    assert outcome.seconds == [4, 2]
+    assert outcome.longest == [3, 2]
+
+
+def test_without_a_guard_a_car_takes_all() -> None:
+    case = cases()[0]
+    found = run_house(house(1), controller(case), case.meter, case.box, case.cars)
+    assert found.energy > 0.99
+    assert found.longest[0] > 60
