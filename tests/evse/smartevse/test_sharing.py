@@ -8,7 +8,10 @@ import pytest
 
 from custom_components.evse_bus.evse.smartevse.dialects import (
     FAMILIES,
+    MAPS,
     STOPS_ALONE,
+    Balancing,
+    Dialect,
     Family,
 )
 from custom_components.evse_bus.evse.smartevse.sharing import (
@@ -194,6 +197,94 @@ def test_a_repeated_request_does_not_undo_its_grant() -> None:
     draw.granted(100, 1.0)
     draw.requested(1.1)
     assert draw.most(1.1) == 100
+
+
+# -- From 2.20 on --------------------------------------------------------------------
+
+V2_30, HEAD, V3_OLD = (
+    MAPS[one].balancing for one in (Dialect.V2_30, Dialect.V2_HEAD, Dialect.V3_OLD)
+)
+
+
+@pytest.mark.parametrize(
+    ("row", "until"), [(V2_30, 12.0), (HEAD, 18.0), (V3_OLD, float("inf"))]
+)
+def test_a_silent_node_counts_until_it_has_stopped_by_itself(
+    row: Balancing, until: float
+) -> None:
+    draw = Draw(row)
+    draw.read(160, 0.0, Contactor.CLOSED)
+    assert draw.most(min(until, 1e6) - 0.1) == 160
+    assert draw.most(min(until, 1e6)) == (0 if until < float("inf") else 160)
+
+
+def test_a_node_that_was_sent_0_counts_until_that_is_confirmed_or_it_stops() -> None:
+    draw = Draw(V2_30)
+    draw.read(160, 0.0, Contactor.CLOSED)
+    for second in range(1, 12, 2):
+        draw.sent(0, second)
+        assert draw.most(second) == 160
+    assert draw.may_charge(11.9)
+    # It has received one of them, or has missed all and stopped.
+    assert not draw.may_charge(12.0)
+    draw.read(0, 12.1, Contactor.OPEN)
+    assert draw.most(12.1) == 0
+
+
+@pytest.mark.parametrize("value", [0, 1, 50, 59])
+def test_a_node_that_charges_offers_6_a_at_least(value: int) -> None:
+    draw = Draw(V2_30)
+    draw.read(value, 0.0, Contactor.CLOSED)
+    assert draw.most(0.0) == LOWEST
+    draw.sent(value, 1.0)
+    assert draw.most(1.0) == LOWEST
+
+
+def test_c1_counts_what_came_before_it() -> None:
+    """The car may still draw it, whatever word is read back."""
+    draw = Draw(HEAD)
+    draw.read(160, 0.0, Contactor.CLOSED)
+    draw.sent(0, 1.0)
+    draw.read(0, 2.0, Contactor.ENDING)
+    assert draw.most(2.0) == 160
+    draw.read(0, 4.0, Contactor.OPEN)
+    assert draw.most(4.0) == 0
+
+
+def test_a_grant_counts_all_that_came_before_the_request() -> None:
+    """Its pilot may not have followed a broadcast while it asked."""
+    draw = Draw(V2_30)
+    draw.read(160, 0.0, Contactor.OPEN)
+    draw.sent(60, 1.0)
+    draw.read(60, 2.0, Contactor.ASKED)
+    assert draw.most(2.0) == 0
+    assert draw.at_grant == 160
+    draw.granted_as_broadcast(2.1)
+    assert draw.most(2.1) == 160
+    # It may have received that before its grant.
+    draw.read(60, 3.0, Contactor.CLOSED)
+    assert draw.most(3.0) == 160
+    draw.sent(80, 4.0)
+    draw.read(80, 4.1, Contactor.CLOSED)
+    assert draw.most(4.1) == 80
+
+
+def test_a_grant_after_a_fresh_start_costs_6_a() -> None:
+    draw = Draw(V2_30)
+    draw.read(0, 0.0, Contactor.OPEN)
+    draw.read(0, 1.0, Contactor.ASKED)
+    assert draw.at_grant == LOWEST
+    draw.sent(60, 1.1)
+    draw.granted_as_broadcast(1.2)
+    assert draw.most(1.2) == LOWEST
+
+
+def test_one_that_may_go_on_for_ever_is_unknown_until_it_is_read() -> None:
+    draw = Draw(V3_OLD, unknown_since=0.0)
+    draw.sent(0, 1.0)
+    assert draw.most(1e6) == float("inf")
+    draw.read(60, 1e6, Contactor.CLOSED)
+    assert draw.most(1e6) == 60
 
 
 # -- The property ------------------------------------------------------------------

@@ -1,0 +1,74 @@
+"""The answer to a polled state, decided at the moment it is sent."""
+
+import asyncio
+
+import pytest
+
+from custom_components.evse_bus.evse.errors import SupersededError
+from custom_components.evse_bus.evse.smartevse.dialects import Status
+from custom_components.evse_bus.evse.smartevse.handshake_polled import (
+    ANSWER_WITHIN,
+    PolledHandshake,
+)
+from custom_components.evse_bus.evse.smartevse.sharing import Contactor
+from tests.evse.smartevse.scene import MasterScene
+from tests.simulated_time import now, simulate
+
+ASKS = Status(raw_state="G", error=0, current=6.0, access=True, maximum=32)
+GRANTED, REFUSED = bytes((0, 7, 0, 0)), bytes((0, 6, 0, 1))
+
+
+def answer(handshake: PolledHandshake, scene: MasterScene) -> bytes:
+    """Return the state and the error that would be written now."""
+    return handshake._answer_frame(scene.master)[7:11]
+
+
+def test_a_status_is_answered_once() -> None:
+    """Written again, it would close the contactor of a box whose car has left."""
+
+    async def scene() -> None:
+        async with MasterScene(units=(2,), dialect="2.30") as scene:
+            await asyncio.sleep(8)
+            handshake = PolledHandshake(scene.slave(2))
+            handshake.on_status(ASKS, now())
+            assert answer(handshake, scene) == GRANTED
+            with pytest.raises(SupersededError):
+                answer(handshake, scene)
+            handshake.on_status(ASKS, now())
+            assert answer(handshake, scene) == GRANTED
+
+    simulate(scene())
+
+
+def test_an_old_status_is_not_answered() -> None:
+    async def scene() -> None:
+        async with MasterScene(units=(2,), dialect="2.30") as scene:
+            await asyncio.sleep(8)
+            handshake = PolledHandshake(scene.slave(2))
+            handshake.on_status(ASKS, now())
+            await asyncio.sleep(ANSWER_WITHIN + 0.01)
+            assert handshake.after_poll(scene.master) is None
+            with pytest.raises(SupersededError):
+                answer(handshake, scene)
+
+    simulate(scene())
+
+
+@pytest.mark.parametrize(("before", "then"), [(60, GRANTED), (160, REFUSED)])
+def test_what_its_pilot_may_show_must_fit(before: int, then: bytes) -> None:
+    """It was charging with 16 A a moment ago; meanwhile the other goes up to 10 A."""
+
+    async def scene() -> None:
+        async with MasterScene(units=(2, 3), dialect="2.30", current=10.0) as scene:
+            await asyncio.sleep(8)
+            await scene.charge(3)
+            await asyncio.sleep(3)
+            assert scene.offers == 10
+            draw = scene.master.draw(2)
+            draw.read(before, now(), Contactor.OPEN)
+            draw.read(60, now(), Contactor.ASKED)
+            handshake = PolledHandshake(scene.slave(2))
+            handshake.on_status(ASKS, now())
+            assert answer(handshake, scene) == then
+
+    simulate(scene())
