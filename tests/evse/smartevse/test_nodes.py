@@ -86,6 +86,28 @@ def test_a_car_is_granted_b_then_c_and_has_its_current_at_once(dialect: str) -> 
 
 
 @each
+def test_one_that_waits_with_a_word_of_0_is_not_shown_at_its_maximum(
+    dialect: str,
+) -> None:
+    """HEAD without a master begins at its maximum while it reports 0."""
+
+    async def scene() -> None:
+        async with scene_of(dialect, units=(2, 3)) as scene:
+            await asyncio.sleep(8)
+            scene.box(3).car.plug_in(request=False)
+            await scene.until(lambda: scene.box(3).state == "B")
+            await scene.charge(2)
+            await asyncio.sleep(3 * ROUND)
+            slave = scene.slave(3)
+            assert slave.status is not None
+            assert (slave.status.raw_state, slave.status.current) == ("B", 0)
+            assert slave.reading is not None
+            assert slave.reading.offered_current == 6
+
+    simulate(scene())
+
+
+@each
 def test_each_request_is_answered_within_a_round(dialect: str) -> None:
     async def scene() -> None:
         async with scene_of(dialect, units=tuple(range(2, 9)), limit=63.0) as scene:

@@ -14,6 +14,9 @@ from .states import (
     state_of,
 )
 
+_MASTER: Final = 1
+"""The setting of load balancing of a master; that of a node is its address."""
+
 _CAPABILITIES: Final = frozenset(
     {
         Capability.STATUS,
@@ -76,6 +79,7 @@ def charger_reading(
     ocpp = ocpp_status(dialect, status)
     if ocpp is OcppStatus.OUT_OF_SERVICE and waits:
         ocpp = OcppStatus.SUSPENDED_EVSE
+    has_master = configuration is not None and configuration.load_balancing > _MASTER
     connector = ConnectorReading(
         status=ocpp,
         raw_state=status.raw_state,
@@ -86,7 +90,11 @@ def charger_reading(
     return ChargerReading(
         connectors={1: connector},
         allowed=status.access,
-        offered_current=None if state is UNKNOWN else offered(dialect, status),
+        offered_current=(
+            None
+            if state is UNKNOWN
+            else offered(dialect, status, has_master=has_master)
+        ),
         maximum_current=min(
             (float(one) for one in maxima if one is not None), default=None
         ),

@@ -100,11 +100,13 @@ def is_stopped(dialect: Dialect, status: Status) -> bool:
     return status.raw_state in closed
 
 
-def offered(dialect: Dialect, status: Status) -> float | None:
+def offered(
+    dialect: Dialect, status: Status, *, has_master: bool = False
+) -> float | None:
     """Return the current that the pilot offers, or may, A; ``None``: there is no car.
 
-    A box whose current is out of range offers 6 A; but one that begins a charge at its
-    maximum may report 0 then (`Map.begins_at_0`; PROTOCOLS.md, 3).
+    A box whose current is out of range offers 6 A; but one without a master that begins
+    a charge at its maximum may report 0 then (`Map.begins_at_0`; PROTOCOLS.md, 3).
     """
     offers = state_of(dialect, status.raw_state).offers
     if offers is None:
@@ -113,7 +115,8 @@ def offered(dialect: Dialect, status: Status) -> float | None:
         return 0.0
     if MINIMUM_CURRENT <= status.current <= MAXIMUM_CURRENT:
         return status.current
-    if MAPS[dialect].begins_at_0 and status.current == 0 and status.maximum is not None:
+    may_begin_at_0 = MAPS[dialect].begins_at_0 and not has_master
+    if may_begin_at_0 and status.current == 0 and status.maximum is not None:
         return float(max(status.maximum, MINIMUM_CURRENT))
     return MINIMUM_CURRENT
 
