@@ -96,7 +96,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("names", nargs="*", choices=BENCHMARKS, metavar="NAME")
     parser.add_argument(
-        "--quick", action="store_true", help="a short run: rough figures in 15 minutes"
+        "--quick", action="store_true", help="a short run: rough figures in 20 minutes"
     )
     parser.add_argument(
         "--minutes", type=float, help="length of each scene of smartevse-master"
