@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from math import floor, inf
 from typing import Final
 
-from custom_components.evse_bus.house.allotment import Allotment
+from custom_components.evse_bus.house.composition import House
+from custom_components.evse_bus.house.fuse import Guarded
 from custom_components.evse_bus.house.readings import (
     BatteryReport,
     ChargerReport,
@@ -18,7 +19,6 @@ from custom_components.evse_bus.house.readings import (
     GridReport,
     Mode,
 )
-from custom_components.evse_bus.house.surplus import Surplus
 
 from .sun_plant import MAXIMUM, MINIMUM, VOLTS, Cell, Seen
 
@@ -31,15 +31,14 @@ NIGHT: Final = 3600.0
 
 
 class Account:
-    """The controller of the house."""
+    """The controller of the house, without a fuse."""
 
     every = 10
     every_report = True
 
     def __init__(self, cell: Cell, mode: Mode = Mode.SUN) -> None:
         """Begin with all cars paused."""
-        self._surplus = Surplus(cell.battery and cell.battery.priority)
-        self._allotment = Allotment()
+        self._house = House(cell.battery and cell.battery.priority)
         settings = [
             ChargerSettings(
                 charger=str(at),
@@ -52,48 +51,35 @@ class Account:
             )
             for at, car in enumerate(cell.cars)
         ]
-        self._allotment.configure(settings, {}, 0.0)
-        self._offers = [0.0] * len(settings)
+        self._phases = {one.charger: one.wired for one in settings}
+        guarded = (Guarded(settings=one) for one in settings)
+        self._house.configure(guarded, {}, 0.0)
         self._last = -inf
 
     def measured(self, at: float, powers: Sequence[float]) -> None:
         """Take what the chargers have measured."""
-        self._surplus.cars(at, sum(powers))
+        if at - self._last > NIGHT:
+            for name in self._phases:
+                away = ChargerReport(at=at, power=0.0, plugged=False)
+                self._house.charger(name, away, at)
+            self._house.look(at)
+        self._last = at
+        for (name, phases), power in zip(self._phases.items(), powers, strict=True):
+            current = power / VOLTS / phases
+            two, three = (current if phases > other else 0.0 for other in (1, 2))
+            currents = (current, two, three)
+            report = ChargerReport(at=at, power=power, currents=currents, plugged=True)
+            self._house.charger(name, report, at)
 
     def look(self, seen: Seen) -> Sequence[float]:
         """Decide at a report of the meter, and every 10 s."""
         now = seen.at
-        if now - self._last > NIGHT:
-            for one in self._allotment.contenders.values():
-                one.take(ChargerReport(at=now, power=0.0, plugged=False), now)
-            self._decide(now)
-        self._last = now
-        for one, power in zip(
-            self._allotment.contenders.values(), seen.powers, strict=True
-        ):
-            phases = one.settings.wired
-            current = power / VOLTS / phases
-            two, three = (current if phases > at else 0.0 for at in (1, 2))
-            currents = (current, two, three)
-            report = ChargerReport(at=now, power=power, currents=currents, plugged=True)
-            one.take(report, now)
         if seen.fresh and seen.grid is not None:
             if seen.charge is not None:
                 battery = BatteryReport(at=now, power=seen.battery, charge=seen.charge)
-                self._surplus.battery(battery, now)
-            self._surplus.grid(GridReport(at=now, power=seen.grid), now)
-        offers = self._decide(now)
-        if offers != self._offers:
-            self._surplus.moved(now)
-        self._offers = offers
-        return offers
-
-    def _decide(self, now: float) -> list[float]:
-        surplus = self._surplus
-        decisions = self._allotment.look(
-            now, surplus.power, surplus.take_elapsed(now), surplus.silence(now)
-        )
-        return [one.current for one in decisions.values()]
+                self._house.battery(battery, now)
+            self._house.grid(GridReport(at=now, power=seen.grid), now)
+        return [one.current for one in self._house.look(now).values()]
 
 
 def _down(current: float, step: float) -> float:

@@ -179,7 +179,6 @@ def test_what_was_kept_goes_on() -> None:
     assert (found["one"].current, found["two"].current) == (6, 0)
     assert allotment.contenders["one"].kept == kept
     assert not allotment.contenders["two"].kept.charging
-    assert allotment.contenders["two"].kept.paused_by_ceiling
 
 
 def test_after_a_restart_the_times_between_starts_count_anew() -> None:

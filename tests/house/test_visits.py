@@ -112,7 +112,6 @@ def test_what_is_kept_comes_back() -> None:
         {"starts": 1.5},
         {"serial": 3},
         {"charging": 1},
-        {"paused_by_ceiling": None},
         {"other": 1},
     ],
 )
@@ -124,11 +123,3 @@ def test_damaged_values_are_lost_ones(changed: dict[str, Any]) -> None:
 def test_anything_else_is_lost_too(values: object) -> None:
     assert Kept.from_dict(values) is None
     assert Kept.from_dict({"mode": values}) is None
-
-
-def test_the_same_visit_must_be_proven() -> None:
-    assert KEPT.same_visit("A1", "7")
-    assert not KEPT.same_visit("A1", "8")
-    assert not KEPT.same_visit("A2", "7")
-    assert not KEPT.same_visit("A1", None)
-    assert not Kept(mode=Mode.SUN).same_visit(None, None)

@@ -155,7 +155,9 @@ class Waiting(StrEnum):
     CHARGER = "charger"
     """Order, charger or cable allow less than the minimum."""
     CAR = "car"
-    """There is no car."""
+    """There is no car, or it takes nothing."""
+    FUSE = "fuse"
+    """The main fuse leaves less than the minimum."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -187,6 +189,7 @@ class SunAccount:
         self._counted = 0.0
         """Ws missed or bought."""
         self._started = -inf
+        self._started_before = -inf
         self._paused = -inf
         self._changed = -inf
         self._steady: float | None = None
@@ -220,6 +223,13 @@ class SunAccount:
             self._pause(now)
         self._steady = None
         return Decision(current=0.0, waiting=waiting)
+
+    def refuse(self) -> Decision:
+        """Take back a start of just now, which the fuse does not permit."""
+        self.charging = False
+        self.current = 0.0
+        self._started = self._started_before
+        return Decision(current=0.0, waiting=Waiting.FUSE)
 
     def rest(self, need: Need) -> Decision:
         """Go on with the minimum for a car that takes nothing; nothing is bought."""
@@ -337,6 +347,7 @@ class SunAccount:
         self._counted = 0.0
         self._steady = None
         self._targets.clear()
+        self._started_before = self._started
         self._started = self._changed = now
 
     def _pause(self, now: float) -> None:

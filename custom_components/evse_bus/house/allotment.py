@@ -40,6 +40,10 @@ class Contender:
         self.decision = Decision(current=0.0, waiting=Waiting.METER)
         self.cap = inf
         """W that the car can take, as it seems."""
+        self.permitted = inf
+        """W that the main fuse leaves."""
+        self.refused = False
+        """The main fuse left less than the minimum when it last wanted to charge."""
         self._report = ChargerReport(at=-inf)
         self._takes_since: float | None = None
         self._idle_since: float | None = None
@@ -59,7 +63,6 @@ class Contender:
             session=self.visit.session,
             starts=self.visit.starts,
             charging=self.account.charging,
-            paused_by_ceiling=not self.account.charging,
         )
 
     def configure(self, settings: ChargerSettings) -> None:
@@ -86,7 +89,7 @@ class Contender:
     @property
     def most(self) -> float:
         """Return the most that the car can take, as far as that is known, W."""
-        return min(self.need.most, self.cap)
+        return min(self.need.most, self.cap, self.permitted)
 
     @property
     def power(self) -> float | None:
@@ -102,10 +105,24 @@ class Contender:
         since = self._idle_since
         return since is not None and now - since >= IDLE
 
-    def take(self, report: ChargerReport, now: float) -> None:
-        """Take what is known of the charger now."""
+    def permit(self, current: float, now: float, *, began: bool) -> Decision:
+        """Apply what the main fuse leaves, A; ``began``: it was charging before."""
+        self.refused = current < self.need.minimum
+        self.permitted = inf
+        if not self.refused:
+            if current < self.need.maximum:
+                self.permitted = current * self.need.per_ampere
+        elif began:
+            self.decision = self.account.park(now, Waiting.FUSE)
+        else:
+            self.visit.starts -= 1
+            self.decision = self.account.refuse()
+        return self.decision
+
+    def take(self, report: ChargerReport, now: float) -> bool:
+        """Take what is known of the charger now; return whether a visit has begun."""
         self._report = report
-        self.visit.look(report, now, paused=not self.account.charging)
+        begun = self.visit.look(report, now, paused=not self.account.charging)
         power = self.power
         charging = self.account.charging
         if power is None or not charging or power >= NOTHING:
@@ -113,6 +130,7 @@ class Contender:
         elif self._idle_since is None:
             self._idle_since = now
         self._look_at_cap(power if charging else None, now)
+        return begun
 
     def _look_at_cap(self, power: float | None, now: float) -> None:
         ampere = self.need.per_ampere

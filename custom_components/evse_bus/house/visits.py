@@ -91,7 +91,6 @@ class Kept:
     starts: int = 0
     charging: bool = False
     """Its last phase; a charger that was paused is paused after a restart."""
-    paused_by_ceiling: bool = False
 
     def as_dict(self) -> dict[str, Any]:
         """Return it for a file."""
@@ -107,21 +106,12 @@ class Kept:
         except KeyError, TypeError, ValueError:
             return None
         texts = (kept.serial, kept.session)
-        flags = (kept.charging, kept.paused_by_ceiling)
         if (
             all(one is None or isinstance(one, str) for one in texts)
-            and all(isinstance(one, bool) for one in flags)
+            and isinstance(values.get("charging", False), bool)
             and type(kept.starts) is int
             and isfinite(kept.starts)
             and kept.starts >= 0
         ):
             return kept
         return None
-
-    def same_visit(self, serial: str | None, session: str | None) -> bool:
-        """Return whether box and visit are provably those of before the restart."""
-        return (
-            None not in {self.serial, self.session}
-            and self.serial == serial
-            and self.session == session
-        )
