@@ -76,6 +76,22 @@ acts = st.lists(
     max_size=16,
 )
 
+silences = st.lists(
+    st.tuples(
+        st.sampled_from(
+            (
+                *("come", "come", "leave", "rest", "ask", "ask"),
+                *("deaf", "no broadcasts", "no broadcasts", "well"),
+            )
+        ),
+        st.integers(0, 2),
+        st.sampled_from((0.3, 1.0, 2.0, 4.0, 8.0, 15.0)),
+    ),
+    min_size=4,
+    max_size=14,
+)
+"""Only cars, and boxes that do not receive what they should."""
+
 CHANGES = {
     "off": OrderChange(allowed=False),
     "on": OrderChange(allowed=True),
@@ -110,6 +126,9 @@ def do_to_box(scene: MixScene, what: str, unit: int, dice: Random) -> None:
             box.mute = True
         case "lossy":
             lossy(box, 0.4, dice)
+        case "no broadcasts":
+            # It is read, and does not receive what it may offer.
+            box.misses = lambda data: data[:1] in (b"\0", b"\x09", b"")
         case "reset":
             scene.power_cycle(unit)
         case "well":
@@ -216,6 +235,27 @@ def test_any_mix_keeps_to_the_supply(
     mix: tuple[str, list[BoxSpec]], limit: float, story: list[Act], seed: int
 ) -> None:
     """Set `SUPPLY_EXAMPLES` for more of them."""
+    family, boxes = mix
+    check(family, boxes, limit, story, seed)
+
+
+@settings(
+    max_examples=EXAMPLES, suppress_health_check=[HealthCheck.too_slow], phases=PHASES
+)
+@given(
+    mix=st.sampled_from(tuple(FAMILIES)).flatmap(
+        lambda family: st.tuples(
+            st.just(family), boxes_of(family).map(lambda boxes: boxes[:3])
+        )
+    ),
+    limit=st.sampled_from((12.0, 20.0, 25.0)),
+    story=silences,
+    seed=st.integers(0, 1000),
+)
+def test_what_a_silent_box_may_be_offering_counts(
+    mix: tuple[str, list[BoxSpec]], limit: float, story: list[Act], seed: int
+) -> None:
+    """Two or three boxes; one does not receive the broadcasts for a while."""
     family, boxes = mix
     check(family, boxes, limit, story, seed)
 
