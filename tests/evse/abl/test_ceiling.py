@@ -3,7 +3,7 @@
 import asyncio
 from contextlib import suppress
 
-from hypothesis import HealthCheck, given, settings, strategies as st
+from hypothesis import HealthCheck, example, given, settings, strategies as st
 import pytest
 
 from custom_components.evse_bus.evse.abl import PROTOCOL, AblCharger
@@ -181,6 +181,12 @@ class Trial:
 
 @pytest.mark.parametrize("tells_icmax", [True, False])
 @settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow], deadline=None)
+@example(
+    # The ceiling falls while a limit is being applied.
+    acts=[(("limit", 6.0), 0.3), (("ceiling", 0.0), 0.02), (("ceiling", 0.0), 0.02)],
+    last=6.0,
+    allowed=None,
+)
 @given(acts=ACTS, last=CEILINGS, allowed=st.sampled_from((None, True)))
 def test_permission_and_ceiling(
     acts: list[tuple[tuple[str, float], float]],

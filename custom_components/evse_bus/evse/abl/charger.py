@@ -182,6 +182,7 @@ class AblCharger(AblWriter):
                     await self.note_pause(by_limit=True)
                 return
             ends_own_pause = self.paused_by_our_limit
+            was_open = self.box.is_open(turn.now)
             self.box.writes.restart(turn.now)
             await self.apply_setpoint(
                 turn,
@@ -196,7 +197,14 @@ class AblCharger(AblWriter):
             if change.allowed is True:
                 self.box.allowed_by_user = True
                 self.box.missed = False
-            await self.note_pause(by_limit=paused)
+            # By what was written: the ceiling may have changed meanwhile.
+            paused = self.box.writes.code == PAUSE
+            if not paused or self.order_to_send(change).allowed is False:
+                await self.note_pause(by_limit=False)
+            elif change.allowed is None and self.is_paused_by_ceiling:
+                await self._note_ceiling_pause(was_open=was_open)
+            else:
+                await self.note_pause(by_limit=True)
 
     async def _require_icmax(self, turn: Turn) -> None:
         """Raise ReplyTimeoutError for a box whose Icmax and maximum are not known yet.
@@ -305,9 +313,10 @@ class AblCharger(AblWriter):
             if not self._may_follow(turn.now, ends_pause=ends_pause):
                 return
             await self.apply_setpoint(turn, lambda: self.setpoint, starts=ends_pause)
+            # By what was written: the ceiling may have changed meanwhile.
             if self.box.writes.code != PAUSE:
                 await self.note_pause(by_limit=False)
-            elif self.is_paused_by_ceiling:
+            elif self.effective_orders.allowed is not False:
                 await self._note_ceiling_pause(was_open=was_open)
 
     @property
