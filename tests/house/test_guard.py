@@ -153,6 +153,12 @@ def test_up_only_to_the_least_of_the_minute() -> None:
     assert house.go(2, 40) == {"one": 12}
 
 
+def test_down_at_once_in_the_first_minute_too() -> None:
+    house = House(fuse=Fuse(rating=25, safe=10))
+    assert house.one.current == 10
+    assert house.go(17, 20) == {"one": 7}
+
+
 def test_below_the_minimum_it_pauses_after_15_s() -> None:
     house = House(period=5)
     house.go(2, 100)
@@ -184,7 +190,7 @@ def test_a_car_that_rises_is_no_reason_for_a_pause() -> None:
     house.go(4, 100)
     house.draws["one"] = 16
     house.now += 10
-    house.report((20, 20, 20))
+    house.report((25, 25, 25))
     house.look()
     assert house.one.current == 6
     assert house.go(4, 10) == {"one": 6}
@@ -270,6 +276,13 @@ def test_what_is_paused_stays_paused_while_the_meter_is_silent() -> None:
     house = House()
     house.go(25, 100)
     assert house.go(2, 10_000, reports=False) == {"one": 0}
+
+
+def test_nothing_is_raised_while_a_report_is_overdue() -> None:
+    house = House()
+    house.go(2, 60)
+    assert house.go(2, 20, reports=False) == {"one": 6}
+    assert house.go(2, 10) == {"one": 16}
 
 
 def test_one_report_and_then_silence_raises_nothing() -> None:
@@ -361,6 +374,15 @@ def test_two_share_by_rank() -> None:
     assert house.go(4, 10) == {"first": 14, "second": 6}
     assert house.go(12.5, 10) == {"first": 6, "second": 6}
     assert house.go(12.5, 30) == {"first": 11.5, "second": 0}
+
+
+def test_chargers_share_a_phase_only_with_those_on_it() -> None:
+    house = House(
+        box("a", wired=1, rotation=Rotation.L2),
+        box("b", wired=1, rotation=Rotation.L2),
+        box("c", wired=1, rotation=Rotation.L3),
+    )
+    assert house.go((23, 4, 2), 100) == {"a": 14, "b": 6, "c": 16}
 
 
 def test_an_idle_charger_gets_what_the_others_leave() -> None:

@@ -144,12 +144,16 @@ class Guard:
             self._since = now
         headroom, best = self._present(self._report, now)
         self._lower(headroom, best, now)
-        if now - self._since >= CONFIRM:
+        if now - self._since >= CONFIRM and not self._overdue(now):
             self._share(self._confirmed(now, headroom), now)
         return {
             name: self._grant(one, headroom, now)
             for name, one in self._chargers.items()
         }
+
+    def _overdue(self, now: float) -> bool:
+        """Return whether a report should have come: nothing is raised without it."""
+        return self._rhythm.age(now) > (self.period or 0.0) * JITTER + AHEAD
 
     def _blind(self, now: float) -> dict[str, Grant]:
         """Go down to the safe current; what is paused stays paused."""

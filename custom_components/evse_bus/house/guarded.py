@@ -99,12 +99,11 @@ class GuardedCharger:
         A car that rises looks like an excess until the charger has reported it.
         """
         since = [one for when, one in self._draws if when >= at - NEAR]
-        drawn = self._pick(max, [*since, *self._last(at)])
-        if since or max(drawn) < FLOWING:
-            return drawn
+        if since or all(one is None for one in self.report.currents):
+            return self._pick(max, [*since, *self._last(at)])
         most = self.standing(now)
-        one, two, three = (max(flows, most) if flows else 0.0 for flows in drawn)
-        return (one, two, three)
+        guarded = self.guarded
+        return in_house((most, most, most), guarded.rotation, guarded.settings.wired)
 
     def _last(self, at: float) -> list[Phases[float]]:
         """Return what was measured last before a time, unless that is too old."""
