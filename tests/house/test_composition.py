@@ -158,12 +158,16 @@ def test_one_that_the_sun_pauses_does_not_want_the_fuse() -> None:
     assert found.reason is Reason.NOT_WANTED
 
 
-def test_another_visit_counts_pauses_for_the_fuse_anew() -> None:
+def test_pauses_for_the_fuse_outlive_a_restart_and_end_with_the_visit() -> None:
     scene = Scene(charger("a", mode=Mode.FAST), fuse=FUSE)
     scene.go(0, 300)
     scene.base = [40] * 3
     scene.go(0, 60)
     assert scene.house.kept["a"]["fuse"]["pauses"] == 1
+    after = House(fuse=FUSE)
+    after.configure(scene.chargers, json.loads(json.dumps(scene.house.kept)), 0)
+    assert after.look(1)["a"].current == 0
+    assert after.kept["a"]["fuse"] == {"pauses": 1, "paused": True}
     for plugged in (False, True):
         scene.now += 1
         report = ChargerReport(at=scene.now, plugged=plugged)
