@@ -1,6 +1,7 @@
 """The answer to a polled state, decided at the moment it is sent."""
 
 import asyncio
+from dataclasses import replace
 
 import pytest
 
@@ -70,5 +71,20 @@ def test_what_its_pilot_may_show_must_fit(before: int, then: bytes) -> None:
             handshake = PolledHandshake(scene.slave(2))
             handshake.on_status(ASKS, now())
             assert answer(handshake, scene) == then
+
+    simulate(scene())
+
+
+def test_one_without_access_is_refused_where_it_goes_on_asking() -> None:
+    """Its access was turned off at the box while it asked."""
+
+    async def scene() -> None:
+        async with MasterScene(units=(2,), dialect="2.30+") as scene:
+            await asyncio.sleep(8)
+            slave = scene.slave(2)
+            slave.status = replace(ASKS, access=False)
+            handshake = PolledHandshake(slave)
+            handshake.on_status(slave.status, now())
+            assert answer(handshake, scene) == REFUSED
 
     simulate(scene())
