@@ -35,7 +35,7 @@ async def test_each_way_says_what_happens_without_home_assistant(
     await flow.submit({"protocol": "smartevse"})
     assert flow.step == "mode"
     assert flow.tells("LOAD BAL Disabled", "no fail-safe", "(MAX) for a moment")
-    assert flow.tells("Slave 1", "Node 1 to 7", "stop charging after 10 to 18 s")
+    assert flow.tells("Slave 1", "Node 1 to 7", "stop charging after 10 to 20 s")
     await flow.choose("polled")
     assert flow.step == "port"
     flow.abort()

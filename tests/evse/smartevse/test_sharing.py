@@ -207,7 +207,7 @@ V2_30, HEAD, V3_OLD = (
 
 
 @pytest.mark.parametrize(
-    ("row", "until"), [(V2_30, 12.0), (HEAD, 18.0), (V3_OLD, float("inf"))]
+    ("row", "until"), [(V2_30, 12.0), (HEAD, 20.0), (V3_OLD, float("inf"))]
 )
 def test_a_silent_node_counts_until_it_has_stopped_by_itself(
     row: Balancing, until: float

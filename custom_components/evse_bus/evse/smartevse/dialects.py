@@ -218,8 +218,9 @@ def _minutes(lowest: int, highest: int) -> Number:
 STOPS_ALONE: Final = 12.0
 """Time without a broadcast after which a box has stopped by itself, s (seen after
 10.7 to 11.1, counted from the last broadcast on the line)."""
-STOPS_GENTLY: Final = 18.0
-"""Likewise, where C1 holds the contactor for up to 6 s more."""
+STOPS_GENTLY: Final = 20.0
+"""Likewise, where NO_COMM comes after up to 12 s, and C1 holds the contactor of a car that
+keeps its request for up to 7 s more."""
 OPENS_WITHIN: Final = 3.0
 """Time in which a box that receives a stop obeys it, s (seen after 0.4 s)."""
 OPENS_GENTLY_WITHIN: Final = 9.0

@@ -18,7 +18,7 @@ CHARGING: Final = frozenset({"C", "D"})
 WAITING: Final = frozenset("EFGH")
 """It waits for its master's answer."""
 STOPPING: Final = "C1"
-"""No current is offered; the contactor opens within 6 s."""
+"""No current is offered; the contactor opens within 7 s."""
 
 _CLOSED: Final = (UNPLUGGED, "B1", STOPPING)
 _STOPPED_BY: Final = frozenset({Fault.NO_COMM, Fault.TEMP_HIGH, Fault.RCD})
