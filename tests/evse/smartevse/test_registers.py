@@ -409,6 +409,17 @@ def test_later_states() -> None:
     assert stopping.temperature == 20
 
 
+@pytest.mark.parametrize("number", [11, 12, 13, 14, 15, 200])
+def test_a_state_without_a_name_hides_nothing(number: int) -> None:
+    """A modem's, or one of newer firmware: it may offer its current."""
+    status = decode_status(Dialect.V3, later(number))
+    assert status.raw_state == str(number)
+    assert offered(Dialect.V3, status) == 10
+    assert ocpp_status(Dialect.V3, status) is None
+    state = state_of(Dialect.V3, status.raw_state)
+    assert (state.plugged, state.charging) == (None, None)
+
+
 def test_an_impossible_temperature_is_none() -> None:
     assert decode_status(HEAD, later(kelvin=0)).temperature is None
     assert decode_status(HEAD, later(serial=0)).serial is None
