@@ -88,3 +88,33 @@ def test_one_without_access_is_refused_where_it_goes_on_asking() -> None:
             assert answer(handshake, scene) == REFUSED
 
     simulate(scene())
+
+
+@pytest.mark.parametrize(
+    ("state", "error", "clears"),
+    [
+        ("A", 1, True),
+        ("A", 0, False),
+        # Another error would keep it from asking, and begin its 60 s anew.
+        ("A", 1 | 2, False),
+        ("A", 1 | 4, False),
+        # In these the write would grant, or stop a charge.
+        ("G", 1, False),
+        ("C", 1, False),
+    ],
+)
+def test_only_a_refusal_alone_is_cleared(
+    state: str, error: int, *, clears: bool
+) -> None:
+    async def scene() -> None:
+        async with MasterScene(units=(2,), dialect="2.30") as scene:
+            await asyncio.sleep(8)
+            handshake = PolledHandshake(scene.slave(2))
+            status = replace(ASKS, raw_state=state, error=error)
+            assert handshake._may_clear(status, scene.master) is clears
+            if clears:
+                handshake.on_status(status, now())
+                assert handshake.after_poll(scene.master) is not None
+                assert handshake._clear_frame(scene.master)[7:11] == bytes(4)
+
+    simulate(scene())

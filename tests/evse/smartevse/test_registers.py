@@ -409,6 +409,14 @@ def test_later_states() -> None:
     assert stopping.temperature == 20
 
 
+def test_the_error_bit_that_means_two_things_in_3x_is_no_fault() -> None:
+    """32: no sun in older ones, a test of its residual current monitor in newer ones."""
+    status = decode_status(HEAD, words(0, 1 | 32, 100, 1, 0, 1, 0, 16, 0, 0, 293, 1))
+    assert faults_of(HEAD, status) == {Fault.LESS_6A, Fault.NO_SUN}
+    for dialect in (Dialect.V3, Dialect.V3_OLD):
+        assert faults_of(dialect, status) == {Fault.LESS_6A}
+
+
 @pytest.mark.parametrize("number", [11, 12, 13, 14, 15, 200])
 def test_a_state_without_a_name_hides_nothing(number: int) -> None:
     """A modem's, or one of newer firmware: it may offer its current."""
