@@ -561,7 +561,8 @@ def test_absent_nodes_are_asked_one_a_round_and_delay_nobody(dialect: str) -> No
             assert len(others) <= 60 / PERIOD + 1
             own = [s.when for s in scene.line.sent if s.data[:2] == b"\x02\x04"]
             gaps = [b - a for a, b in pairwise(own) if a > begin]
-            assert max(gaps) < PERIOD + 0.6
+            # A probe of one of them, and then a broadcast, may be first.
+            assert max(gaps) < PERIOD + 0.7
             assert max(scene.gaps(begin)) <= PERIOD + SLACK + 0.03
 
     simulate(scene())

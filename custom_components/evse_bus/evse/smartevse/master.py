@@ -28,7 +28,7 @@ from ..modbus import ModbusFrame
 from ..model import Circuit, Fault
 from ..safety import Setpoint
 from .balancing import broadcast, decode_request, is_foreign_broadcast
-from .dialects import FAMILIES, MAPS, Balancing, Dialect, Family
+from .dialects import FAMILIES, MAPS, Balancing, Dialect, Family, Handshake
 from .member import Member
 from .memory import SmartEvseMemory
 from .other_masters import OtherMasters
@@ -316,9 +316,16 @@ class Master(BusMaster):
             self._on_read(unit)
         self.update_shares()
 
-    def on_missed(self, unit: int) -> None:
-        """Note that a slave did not reply."""
+    def on_complete(self, unit: int) -> None:
+        """Note that the settings of a slave are known, too."""
         self._on_read(unit)
+        self.update_shares()
+
+    def on_missed(self, unit: int, *, gone: bool) -> None:
+        """Note that a slave did not reply; ``gone``: several times in a row."""
+        # One lost reply does not show whom a broadcast would reach.
+        if gone or self._reading_time < READING_ALL:
+            self._on_read(unit)
         self.update_shares()
 
     def _on_read(self, unit: int) -> None:
@@ -379,13 +386,14 @@ class Master(BusMaster):
         before = self._values
         self._values = self._by_unit(setpoints)
         for unit, draw in self._draws.items():
-            draw.sent(self._values[unit - 1], now)
+            draw.sent(_value(self._values, unit), now)
         for slave in self.slaves:
-            lower = before and self._values[slave.unit - 1] < before[slave.unit - 1]
+            lower = _value(self._values, slave.unit) < _value(before, slave.unit)
             if lower and self.draw(slave.unit).may_charge(now):
                 # Until it has confirmed that, no other slave can go up.
                 slave.read_soon(now)
-        frame = broadcast(self._family, setpoints)
+        reached = {u: one for u, one in setpoints.items() if u <= len(self._values)}
+        frame = broadcast(self._family, reached)
         self._memory.broadcast_at = now
         self._has_sent = True
         self._others.sent(frame, now)
@@ -514,7 +522,12 @@ class Master(BusMaster):
     # -- Slaves that do not reply ------------------------------------------------
 
     def next_probe(self, now: float) -> float:
-        """Return when one that has not replied is to be read again: one a period."""
+        """Return when one that has not replied is to be read again: one a period.
+
+        Before the broadcasts begin, it delays none.
+        """
+        if self._phase is _Phase.READING:
+            return now
         self._probed_at = max(now, self._probed_at) + PERIOD
         return self._probed_at
 
@@ -599,8 +612,9 @@ class Master(BusMaster):
         if is_foreign_broadcast(frame):
             return True
         request = decode_request(frame)
-        if request is not None and request.unit in self._draws:
-            self._draws[request.unit].requested(now)
+        draw = self._draws.get(request.unit) if request is not None else None
+        if draw is not None and draw.row.handshake is Handshake.REQUESTS:
+            draw.requested(now)
         # While we are silent no slave may queue an answer: it would never be sent.
         return request is not None and self.silent
 
@@ -616,6 +630,15 @@ class Master(BusMaster):
         if is_new and self.bus is not None:
             _LOGGER.warning("%s: %s", self.bus.name, _OTHER_MASTER)
             self.bus.silence(_OTHER_MASTER)
+
+
+def _value(values: Sequence[int], unit: int) -> int:
+    """Return the value for a unit in a broadcast, 0.1 A; 0: it has none.
+
+    A broadcast of 2.17 ends with unit 4; a slave that was never read may have a higher
+    address.
+    """
+    return values[unit - 1] if unit <= len(values) else 0
 
 
 def _other_master() -> NotAvailableError:

@@ -43,8 +43,11 @@ class Balancer(Protocol):
     ) -> None:
         """Note a status: the current read back, 0.1 A, and the contactor."""
 
-    def on_missed(self, unit: int) -> None:
-        """Note that a slave did not reply."""
+    def on_complete(self, unit: int) -> None:
+        """Note that the settings of a slave are known, too."""
+
+    def on_missed(self, unit: int, *, gone: bool) -> None:
+        """Note that a slave did not reply; ``gone``: several times in a row."""
 
     def update_shares(self) -> None:
         """Share anew; broadcast at once if that changes a value."""

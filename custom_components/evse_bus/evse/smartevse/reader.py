@@ -400,8 +400,12 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
         self.configuration = configuration
         self.configuration_due = turn.now + CONFIGURATION_INTERVAL
         if self.status is not None:
-            self.on_status(self.status, turn.now)
+            self.on_configuration(self.status, turn.now)
         return True
+
+    def on_configuration(self, status: Status, now: float) -> None:
+        """Follow settings that were just read; ``status`` is from before them."""
+        self.on_status(status, now)
 
     # -- Access --------------------------------------------------------------------
 

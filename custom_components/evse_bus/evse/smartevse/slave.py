@@ -406,6 +406,13 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Member):
             # Access is on already: nothing is left to restore.
             self._paused_by_us = False
 
+    @override
+    def on_configuration(self, status: Status, now: float) -> None:
+        # Broadcasts and grants may have been sent since that status, so it is no
+        # reading of its current, nor a request.
+        super().on_status(status, now)
+        self.master.on_complete(self.unit)
+
     def _contactor(self, status: Status) -> Contactor:
         state = status.raw_state
         if not self._is_polled:
@@ -435,7 +442,7 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Member):
             # No second attempt within a round, and one such box in each.
             ready = max(self.slot.ready, self.master.next_probe(now))
             self.slot.ready = self.slot.due = ready
-        self.master.on_missed(self.unit)
+        self.master.on_missed(self.unit, gone=self.misses >= TIMING.misses)
 
     @override
     async def write_state(self, turn: Turn, request: Request) -> None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from ..model import MAXIMUM_CURRENT, MINIMUM_CURRENT, Fault, Status as OcppStatus
-from .dialects import MAPS, Dialect, Status
+from .dialects import ASKS_FOR_B, ASKS_FOR_C, MAPS, Dialect, Status
 
 UNPLUGGED: Final = "A"
 CHARGING: Final = frozenset({"C", "D"})
@@ -20,7 +20,8 @@ WAITING: Final = frozenset("EFGH")
 STOPPING: Final = "C1"
 """No current is offered; the contactor opens within 7 s."""
 
-_CLOSED: Final = (UNPLUGGED, "B1", STOPPING)
+_STOPPED: Final = (UNPLUGGED, "B1", STOPPING, ASKS_FOR_B, ASKS_FOR_C)
+"""States of a box without access. One that asks goes on asking, and is refused."""
 _STOPPED_BY: Final = frozenset({Fault.NO_COMM, Fault.TEMP_HIGH, Fault.RCD})
 """Faults of box or installation; the others mean that there is no current now."""
 
@@ -96,8 +97,8 @@ def is_stopped(dialect: Dialect, status: Status) -> bool:
     if status.access is not False:
         return False
     # One that wakes a car up (T) goes on to B, and from there to C.
-    closed = _CLOSED if MAPS[dialect].shows_plug else (UNPLUGGED,)
-    return status.raw_state in closed
+    stopped = _STOPPED if MAPS[dialect].shows_plug else (UNPLUGGED,)
+    return status.raw_state in stopped
 
 
 def offered(
