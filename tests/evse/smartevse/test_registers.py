@@ -409,6 +409,18 @@ def test_later_states() -> None:
     assert stopping.temperature == 20
 
 
+@pytest.mark.parametrize(
+    ("dialect", "access"),
+    [(V2_30, None), (HEAD, None), (Dialect.V3_OLD, False), (Dialect.V3, False)],
+)
+def test_access_2_is_a_pause_in_3x(dialect: Dialect, access: bool | None) -> None:  # noqa: FBT001
+    """The others never report it; a 3.x waits for a new 1."""
+    data = words(9, 0, 0, 0, 0, 2, 0, 16, 0, 0, 293, 1)
+    assert decode_status(dialect, data).access is access
+    polled = MAPS[dialect].balancing.status
+    assert decode_status(dialect, data[:16], polled).access is access
+
+
 def test_the_error_bit_that_means_two_things_in_3x_is_no_fault() -> None:
     """32: no sun in older ones, a test of its residual current monitor in newer ones."""
     status = decode_status(HEAD, words(0, 1 | 32, 100, 1, 0, 1, 0, 16, 0, 0, 293, 1))
