@@ -474,6 +474,27 @@ def test_never_more_than_the_cable_of_the_next_car(dialect: str) -> None:
 
 
 @each
+def test_the_cable_is_not_forgotten_with_a_lost_reply(dialect: str) -> None:
+    async def scene() -> None:
+        async with scene_of(dialect, limit=32.0, current=32.0, maximum=32) as scene:
+            scene.box(2).controller.outlet.cable = 13
+            await charging(scene, 2)
+            assert scene.offers == 13
+            scene.box(2).mute = True
+            begin = now()
+            await scene.until(lambda: scene.slave(2).status is None)
+            await asyncio.sleep(ROUND)
+            assert scene.slave(2).limits.ceiling == 13
+            await asyncio.sleep(2 * ROUND)
+            scene.box(2).mute = False
+            await asyncio.sleep(ROUND)
+            sent = [one.values[1] for one in scene.broadcasts(begin)]
+            assert max(sent) == 130
+
+    simulate(scene())
+
+
+@each
 def test_6_a_while_no_cable_was_measured(dialect: str) -> None:
     async def scene() -> None:
         async with scene_of(dialect, limit=32.0) as scene:
