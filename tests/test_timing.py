@@ -41,8 +41,10 @@ TIMED = (
     "smartevse/handshake_requests.py",
     "smartevse/master.py",
     "smartevse/other_masters.py",
+    "smartevse/plug.py",
     "smartevse/polled.py",
     "smartevse/reader.py",
+    "smartevse/scan.py",
     "smartevse/slave.py",
 )
 """Files whose times must all be in the tables."""
@@ -54,6 +56,7 @@ OTHERS = {
     "bus.FAILURES_WINDOW",
     "ews.network.listener.CROWD_LOGGED",
     "smartevse.dialects.Map.search_time",
+    "smartevse.scan.POLLED_UNITS",
 }
 """Constants of these files that are no times of a line."""
 

@@ -558,6 +558,27 @@ KEPT = {
 }
 
 
+@each
+def test_no_request_comes_sooner_than_that_of_a_recorded_master(dialect: str) -> None:
+    async def scene() -> None:
+        async with scene_of(dialect, units=(2, 3), limit=20.0) as scene:
+            await scene.charge(2)
+            silences: list[float] = []
+            add_up = scene.line.on_sent
+
+            def note(sent: Sent) -> None:
+                silences.append(now() - scene.line.busy_until)
+                add_up(sent)
+
+            scene.line.on_sent = note
+            await scene.charge(3)
+            await asyncio.sleep(10)
+            assert len(silences) > 10
+            assert min(silences) >= 0.03 - 1e-6
+
+    simulate(scene())
+
+
 @pytest.mark.parametrize("dialect", ["2.20", "2.30", "2.30+", "3"])
 def test_absent_nodes_are_asked_one_a_round_and_delay_nobody(dialect: str) -> None:
     async def scene() -> None:
