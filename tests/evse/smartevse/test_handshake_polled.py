@@ -41,16 +41,19 @@ def test_a_status_is_answered_once() -> None:
     simulate(scene())
 
 
-def test_an_old_status_is_not_answered() -> None:
+def test_an_old_status_is_not_answered_but_read_again_at_once() -> None:
     async def scene() -> None:
         async with MasterScene(units=(2,), dialect="2.30") as scene:
             await asyncio.sleep(8)
-            handshake = PolledHandshake(scene.slave(2))
+            slave = scene.slave(2)
+            handshake = PolledHandshake(slave)
             handshake.on_status(ASKS, now())
             await asyncio.sleep(ANSWER_WITHIN + 0.01)
             assert handshake.after_poll(scene.master) is None
+            slave.slot.ready = now() + 1.0
             with pytest.raises(SupersededError):
                 answer(handshake, scene)
+            assert slave.slot.ready == now()
 
     simulate(scene())
 

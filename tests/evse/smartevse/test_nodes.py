@@ -6,6 +6,7 @@ from itertools import pairwise
 import pytest
 
 from custom_components.evse_bus.evse.errors import NotAvailableError, NotConfirmedError
+from custom_components.evse_bus.evse.exchange import Turn
 from custom_components.evse_bus.evse.model import (
     Circuit,
     FailSafe,
@@ -125,6 +126,49 @@ def test_each_request_is_answered_within_a_round(dialect: str) -> None:
                         waiting.pop(unit, None)
             assert all(scene.box(unit).state == "C" for unit in scene.units)
             assert max(scene.gaps(1010.0)) <= PERIOD + SLACK + 0.03
+
+    simulate(scene())
+
+
+@each_2
+@pytest.mark.parametrize("after", [0.3, 0.8, 1.3, 1.8])
+def test_a_wish_that_a_command_has_read_waits_for_no_poll(
+    dialect: str, after: float
+) -> None:
+    async def scene() -> None:
+        async with scene_of(dialect, allowed=False) as scene:
+            await asyncio.sleep(8)
+            scene.box(2).car.plug_in()
+            await asyncio.sleep(6 + after)
+            await scene.slave(2).change_orders(OrderChange(allowed=True))
+            allowed = now()
+            await asyncio.sleep(0.7)
+            assert states(scene, 2, allowed - 0.5)[:1] == [(5, 0)]
+
+    simulate(scene())
+
+
+def test_a_broadcast_in_the_turn_of_a_box_is_not_repeated_at_once() -> None:
+    async def scene() -> None:
+        # A lowered supply is exceeded until the boxes have followed.
+        async with scene_of("2.30", units=(2, 3), watch=False) as scene:
+            await charging(scene, 2, 3)
+            master = scene.master
+
+            async def lower(turn: Turn) -> None:
+                lowered = asyncio.create_task(
+                    master.change_circuit(Circuit(limit=14, minimum=6))
+                )
+                await asyncio.sleep(0)
+                await master.send_broadcast(turn)
+                await lowered
+
+            await scene.until(lambda: now() - scene.broadcasts()[-1].when > 0.3)
+            begun = now()
+            await scene.slave(2).run(lower)
+            await asyncio.sleep(0.3)
+            sent = [sent.values for sent in scene.broadcasts(begun)]
+            assert sent == [(0, 70, 70, 0, 0, 0, 0, 0)]
 
     simulate(scene())
 

@@ -39,11 +39,15 @@ class PolledHandshake:
         self._status: Status | None = None
         """The status that may be answered; ``None``: there is none, or it was."""
         self._read_at = -inf
+        self._is_answering = False
 
     def on_status(self, status: Status, now: float) -> None:
         """Take note of a status that was just read."""
         self._status = status
         self._read_at = now
+        if self._calls_for_answer(status) and not self._is_answering:
+            # Only a poll is followed by an answer; after one, the next is planned anew.
+            self._slave.read_soon(now)
 
     def after_poll(self, master: Balancer) -> FollowUp | None:
         """Return the conversation that the status calls for, if any."""
@@ -51,11 +55,14 @@ class PolledHandshake:
         if status is None:
             return None
         worst_case = self._slave.worst_case
-        if asks(status) and (self._may_grant or self._must_refuse):
+        if self._calls_for_answer(status):
             return FollowUp(partial(self._answer, master), worst_case=worst_case)
         if self._may_clear(status, master):
             return FollowUp(partial(self._clear, master), worst_case=worst_case)
         return None
+
+    def _calls_for_answer(self, status: Status) -> bool:
+        return asks(status) and (self._may_grant or self._must_refuse)
 
     def _fresh(self, now: float) -> Status | None:
         """Return the status that may be answered now."""
@@ -64,6 +71,9 @@ class PolledHandshake:
     def _take(self, now: float) -> Status:
         """Return the status that is answered now; raises SupersededError without one."""
         status = self._fresh(now)
+        if status is None and self._status is not None:
+            # It has waited for others for too long, but no longer for its next poll.
+            self._slave.read_soon(now)
         self._status = None
         if status is None:
             message = "a status that is no longer new is not answered"
@@ -102,14 +112,18 @@ class PolledHandshake:
         """Grant or refuse, once there is room for it: a conversation."""
         slave = self._slave
         rounds = ROUNDS
-        with suppress(EvseError):
-            while rounds and self._needs_room(master):
-                rounds -= 1
-                await master.lower(turn, master.above_share(slave.unit))
-                await rest(worst_case=slave.worst_case)
-                await slave.read_status_once(turn)
-                await rest(worst_case=slave.worst_case)
-            await slave.write_state(turn, partial(self._answer_frame, master))
+        self._is_answering = True
+        try:
+            with suppress(EvseError):
+                while rounds and self._needs_room(master):
+                    rounds -= 1
+                    await master.lower(turn, master.above_share(slave.unit))
+                    await rest(worst_case=slave.worst_case)
+                    await slave.read_status_once(turn)
+                    await rest(worst_case=slave.worst_case)
+                await slave.write_state(turn, partial(self._answer_frame, master))
+        finally:
+            self._is_answering = False
         master.update_shares()
 
     def _needs_room(self, master: Balancer) -> bool:

@@ -410,6 +410,10 @@ class Master(BusMaster):
             raise _mixed()
         if self._phase is _Phase.BROADCASTING:
             await turn.send(partial(self.unless_forbidden, self._broadcast))
+            now = self.now
+            if now < self._planned and self._setpoints(now) == self._values:
+                # Nothing is left to be broadcast before the next regular one.
+                self.slot.ready = max(self.slot.ready, self._planned)
 
     @override
     async def turn(self, turn: Turn) -> None:

@@ -394,7 +394,8 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Member):
         elif self._charging_since == inf:
             # Begun before our start, or under another master.
             self._charging_since = now
-        self._polled.on_status(status, now)
+        if self._is_polled:
+            self._polled.on_status(status, now)
         self.master.on_status(
             self.unit,
             round(status.current * 10),
