@@ -77,7 +77,7 @@ class House:
         line = EvboxLine(self.box)
         bus = Bus(line, EvboxFramer(), PROTOCOL.timing, "simulated")
         charger = EvboxCharger(CONFIG, orders)
-        charger.commit = lambda orders: store.async_commit(KEY, orders)
+        charger.standing_orders.commit = lambda orders: store.async_commit(KEY, orders)
         bus.add(charger)
         self.life = Running(store, line, bus, charger)
         await bus.start()

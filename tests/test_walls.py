@@ -157,11 +157,17 @@ def test_the_words_import_nothing(name: str) -> None:
     assert outside(EVSE / f"{name}.py", EVSE) <= set(sys.stdlib_module_names)
 
 
-def test_the_clamp_and_the_schedule_are_pure() -> None:
+def test_clamp_schedule_and_ceiling_are_pure() -> None:
     assert local(EVSE / "safety.py", EVSE) == {"errors", "model"}
     assert local(EVSE / "schedule.py", EVSE) == set()
-    for name in ("safety", "schedule"):
+    assert local(EVSE / "ceiling.py", EVSE) == {"errors", "model", "safety"}
+    for name in ("safety", "schedule", "ceiling"):
         assert "asyncio" not in outside(EVSE / f"{name}.py", EVSE)
+
+
+def test_standing_orders_do_not_know_the_ceiling() -> None:
+    used = local(EVSE / "standing_orders.py", EVSE)
+    assert not used & {"ceiling", "governance", "charger", "bus"}
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)

@@ -256,7 +256,7 @@ def test_a_raise_counts_when_confirmed_a_lowering_at_once() -> None:
                 sent.append(len(bus.line.times(1, "W")))
 
             sent: list[int] = []
-            charger.commit = commit
+            charger.standing_orders.commit = commit
             bus.line.devices[1].alive = False
             with pytest.raises(ReplyTimeoutError):
                 await charger.change_orders(OrderChange(current=20.0))

@@ -38,7 +38,7 @@ class SlowCharger(SimulatedCharger):
 
     @override
     async def apply(self, turn: Turn, orders: Orders, change: OrderChange) -> None:
-        orders = self.confirmed_target(change)
+        orders = self.standing_orders.confirmed_target(change)
         await self.say(turn, "W", int(clamp(orders, self.limits).current))
         await rest(1.0)
         await self.say(turn, "V")
@@ -107,7 +107,7 @@ def test_a_lowering_that_cannot_be_stored_is_sent_all_the_same() -> None:
             async def full(_orders: Orders) -> None:
                 raise OSError("disk full")
 
-            charger.commit = full
+            charger.standing_orders.commit = full
             await charger.change_orders(OrderChange(allowed=False))
             assert writes(bus) == [0]
             await charger.change_orders(OrderChange(allowed=True))

@@ -357,7 +357,7 @@ class BusChargers:
     def _put_on_bus(self, managed: ManagedCharger) -> None:
         charger, watcher = managed.charger, self._watcher
         charger.accepts = partial(self._accepts, managed)
-        charger.commit = partial(self._async_commit, managed)
+        charger.standing_orders.commit = partial(self._async_commit, managed)
         managed.subscriptions.append(
             charger.subscribe(partial(watcher.on_charger, managed))
         )

@@ -24,7 +24,7 @@ from .errors import (
 )
 from .exchange import Turn, Wire
 from .framing import Frame, Framer, Timing
-from .jobs import Job, JobQueue
+from .jobs import Job, JobOwner, JobQueue
 from .line import Line
 from .listeners import Observable
 from .load import ENDS_AT, Overload, Recurring, find_overload
@@ -247,9 +247,9 @@ class Bus(Observable):
         )
         return await self.submit(job)  # type: ignore[return-value] # the job's own
 
-    def supersede(self, charger: Charger, which: Callable[[OrderChange], bool]) -> None:
+    def supersede(self, owner: JobOwner, which: Callable[[OrderChange], bool]) -> None:
         """Drop waiting order changes that a newer command makes wrong."""
-        self._jobs.supersede(charger, which)
+        self._jobs.supersede(owner, which)
 
     @property
     def now(self) -> float:
@@ -361,8 +361,8 @@ class Bus(Observable):
     def _expire_ceilings(self) -> float:
         """Lower the ceilings that were not renewed; return when the next one is due."""
         now = self.now
-        chargers = self.chargers.values()
-        return min((one.expire_ceiling(now) for one in chargers), default=inf)
+        governed = [charger.governance for charger in self.chargers.values()]
+        return min((one.expire_ceiling(now) for one in governed), default=inf)
 
     def _slots(self) -> list[Slot]:
         if self._stopping:
@@ -395,7 +395,7 @@ class Bus(Observable):
         elif charger is not None:
             await self._poll_turn(charger)
         if charger is not None:
-            await charger.keep_ceiling_pause()
+            await charger.governance.keep_pause()
         self._respect_minimum(charger)
 
     def _charger_of(self, slot: Slot) -> Charger | None:
@@ -419,7 +419,7 @@ class Bus(Observable):
             master.failed(self.now)
 
     async def _poll_turn(self, charger: Charger) -> None:
-        charger.expire_orders(self.now)
+        charger.standing_orders.expire(self.now)
         poll = RunningConversation(
             charger.poll(Turn(self.wire, charger.statistics)), bursts=charger.bursts
         )

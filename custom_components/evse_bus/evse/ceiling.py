@@ -137,60 +137,19 @@ def with_fail_safe(orders: Orders, amperes: float) -> Orders:
     return replace(orders, fail_safe=fail_safe)
 
 
-class Governance:
-    """Whether a charger is governed, and what follows from that."""
-
-    def __init__(self, orders: Orders) -> None:
-        """Begin with what is noted with the orders."""
-        self.ceiling: Ceiling | None = None
-        self.unproved: CeilingPause | None = None
-        """A pause of an earlier run, as long as it is not proved to be still ours."""
-        self.driver_allows = False
-        """The driver has opened access at the box in this visit."""
-        self.expired = True
-        """It is not renewed; its lowering has been sent."""
-        self.pending = False
-        """The charger has not confirmed the ceiling that counts."""
-        self.retry_at = -inf
-        """Loop time from which it is sent again."""
-        safe = orders.remembered.get(GOVERNED)
-        if safe is None:
-            return
-        note = orders.remembered.get(PAUSED_BY_CEILING)
-        self.unproved = None if note is None else CeilingPause.from_note(note)
-        self.ceiling = Ceiling.first(_safe_from(safe), paused=note is not None)
-
-    def amperes(self, now: float, minimum: float) -> float:
-        """Return what the charger may offer now, A; ``inf``: it is not governed.
-
-        ``minimum``: the least current of the charger, A.
-        """
-        ceiling = self.ceiling
-        if ceiling is None:
-            return inf
-        permitted = ceiling.amperes(now)
-        if self.driver_allows:
-            return max(permitted, min(minimum, ceiling.guard_amperes(now)))
-        return permitted
-
-    def fail_safe(self, orders: Orders, *, paused: bool) -> Orders:
-        """Return orders with the fail-safe current that may be sent with them."""
-        if self.ceiling is None:
-            return orders
-        return with_fail_safe(orders, 0.0 if paused else self.ceiling.safe)
-
-    def allowed_or_stopped(self) -> None:
-        """Take note of the user's word: no pause of ours waits for it any more."""
-        self.unproved = None
-        self.driver_allows = False
-
-
 def released(orders: Orders, safe: float, *, stop: bool) -> Orders:
-    """Return the orders with which a charger is released; never higher than before."""
-    return replace(lowered(orders, safe), allowed=False if stop else orders.allowed)
+    """Return the orders with which a charger is released, without the notes.
+
+    Never higher than before. ``safe``: A.
+    """
+    notes = dict(orders.remembered)
+    for name in (GOVERNED, PAUSED_BY_CEILING):
+        notes.pop(name, None)
+    allowed = False if stop else orders.allowed
+    return replace(lowered(orders, safe), allowed=allowed, remembered=notes)
 
 
-def _safe_from(note: str) -> float:
+def safe_from_note(note: str) -> float:
     """Return a stored safe value, A; 0 for an unreadable one."""
     try:
         return number(float(note), "safe value")

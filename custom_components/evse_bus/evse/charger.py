@@ -1,45 +1,28 @@
-"""The common part of all chargers: orders, presence, turns on the bus.
+"""The common part of all chargers: presence, turns on the bus, what is asked of them.
 
 A protocol folder's charger derives from `Charger` and adds the conversations: what to
-ask, what to check, what to repeat. The rules for orders live here, so that they hold
-for every protocol alike:
-
-- a lowering counts (and is stored) before it is sent, a raise only after the
-  charger has confirmed it;
-- permission and limit are independent of each other;
-- an order that is not renewed within its lifetime becomes the fail-safe value;
-- a ceiling that the house sets lowers what counts of them (`ceiling`).
+ask, what to check, what to repeat. Its orders have the same rules for every protocol
+(`standing_orders`), and so has the ceiling that the house may set (`governance`).
 
 A charger knows its bus as a `Scheduler`.
 """
 
 from abc import ABC, abstractmethod
 import asyncio
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
-import logging
 from math import inf
-from typing import ClassVar, Final, Protocol, override
+from typing import ClassVar, Final, override
 
-from .ceiling import (
-    GOVERNED,
-    PAUSED_BY_CEILING,
-    RETRY,
-    Ceiling,
-    CeilingPause,
-    Governance,
-    lowered,
-    released,
-)
-from .conversation import Conversation, FollowUp, nothing
-from .errors import NotAvailableError, RefusedOrderError
+from .ceiling import CeilingPause
+from .conversation import Conversation, FollowUp
+from .errors import NotAvailableError
 from .events import EventListener, Events
-from .exchange import Turn, Wire
+from .exchange import Turn
 from .framing import Frame, Timing
-from .jobs import Job, merge_key
-from .line import Line
+from .governance import Governance
+from .jobs import Job
 from .listeners import Observable
 from .memory import LineMemory, Renewals
 from .model import (
@@ -60,58 +43,16 @@ from .model import (
 )
 from .pause_watch import PauseWatch
 from .readings import ChargerInfo, ChargerReading
-from .safety import (
-    Setpoint,
-    cautious,
-    check_change,
-    clamp,
-    expired,
-    number,
-    pause_reason,
-)
+from .safety import Setpoint, check_change
 from .schedule import Kind, Slot
+from .scheduler import Scheduler
+from .standing_orders import StandingOrders
 from .statistics import ChargerStatistics
 from .throttle import PresenceLog
-
-_LOGGER = logging.getLogger(__name__)
 
 PREVENTED: Final = 30.0
 """Time for which a line may prevent all polls of a charger before its reading is too
 old, s."""
-
-
-class Scheduler(Protocol):
-    """A bus, as its chargers and its master know it."""
-
-    name: str
-    line: Line
-    wire: Wire
-
-    @property
-    def chargers(self) -> Mapping[str, Charger]:
-        """Return all chargers of the bus, by key."""
-
-    @property
-    def now(self) -> float:
-        """Return the loop time, s."""
-
-    async def submit(self, job: Job) -> object:
-        """Queue a command and return its result (see `Bus.submit`)."""
-
-    def queue(self, job: Job) -> bool:
-        """Queue a command without a caller (see `Bus.queue`)."""
-
-    def supersede(self, charger: Charger, which: Callable[[OrderChange], bool]) -> None:
-        """Drop waiting order changes that a newer command makes wrong."""
-
-    def worst_case(self, charger: Charger) -> float:
-        """Return the longest time one turn of a charger can take, s."""
-
-    def reschedule(self) -> None:
-        """Choose the next turn anew: something has changed."""
-
-    def silence(self, why: str) -> None:
-        """Fail all waiting commands; drop all readings."""
 
 
 class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
@@ -129,8 +70,6 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         """Begin with the orders that stand; nothing is sent before the bus starts."""
         super().__init__()
         self._config = config
-        self.orders = orders
-        self._requested = orders
         self.reading: ChargerReading | None = None
         self.info: ChargerInfo | None = None
         self.statistics = ChargerStatistics()
@@ -149,10 +88,6 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         """Faults found by this library, beside those the charger reports."""
         self.other_serial: str | None = None
         """Serial number of the last wrong box in its place (`Fault.WRONG_CHARGER`)."""
-        self.orders_expired = False
-        """The orders were not renewed within their lifetime: the fail-safe counts."""
-        self.commit: Callable[[Orders], Awaitable[None]] = _no_commit
-        """Stores orders; awaited before a lowering is sent, after a raise."""
         self.accepts: Callable[[str], bool] = _accept
         """Return whether a box added without its serial number may have this one.
 
@@ -161,15 +96,9 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         """
         self.slot = Slot(kind=Kind.PROBE)
         self._conversations = 0
-        self.bus: Scheduler | None = None
-        self._renewals = Renewals()
-        """That of the line, once it is on a bus."""
-        self.governance = Governance(orders)
-        self._ceiling_job: Job | None = None
-        self._clamped: tuple[tuple[Orders, Limits], Setpoint] | None = None
-        self._reason: (
-            tuple[tuple[Orders, Orders, Limits], PauseReason | None] | None
-        ) = None
+        self.bus: Scheduler[Charger] | None = None
+        self.standing_orders = StandingOrders(self, orders)
+        self.governance = Governance(self, self.standing_orders)
 
     # -- Configuration and state -------------------------------------------------
 
@@ -201,29 +130,9 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         return {"serial": serial}
 
     @property
-    def valid_orders(self) -> Orders:
-        """Return the orders that stand, their lifetime considered."""
-        return expired(self.orders) if self.orders_expired else self.orders
-
-    @property
-    def effective_orders(self) -> Orders:
-        """Return the orders that count now: the valid ones under the ceiling."""
-        return self._under_ceiling(self.valid_orders)
-
-    def _under_ceiling(self, orders: Orders) -> Orders:
-        if self.governance.ceiling is None:
-            return orders
-        now = asyncio.get_running_loop().time()
-        return lowered(orders, self.governance.amperes(now, self.limits.minimum))
-
-    @property
     def setpoint(self) -> Setpoint:
         """Return the set-point that the orders come to now."""
-        inputs = (self.effective_orders, self.limits)
-        # Computed for every poll, and rarely different.
-        if self._clamped is None or self._clamped[0] != inputs:
-            self._clamped = (inputs, clamp(*inputs))
-        return self._clamped[1]
+        return self.governance.permitted
 
     @property
     def waits_for_current(self) -> bool:
@@ -261,12 +170,9 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
             if self.governance.unproved is not None:
                 return PauseReason.WAITS_FOR_USER
             return PauseReason.NOT_ALLOWED
-        inputs = (self.valid_orders, self.effective_orders, self.limits)
-        if self._reason is None or self._reason[0] != inputs:
-            self._reason = (inputs, _reason_of(*inputs))
         waits = self.governance.unproved is not None and self.may_be_paused
         return (
-            self._reason[1]
+            self.governance.pause_reason
             or self.hindrance
             or (PauseReason.WAITS_FOR_USER if waits else None)
         )
@@ -392,7 +298,7 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
 
         Called when it is put on a bus, before it is polled.
         """
-        self._renewals = memory.of(Renewals)
+        self.standing_orders.renewals = memory.of(Renewals)
 
     @abstractmethod
     def on_line_open(self) -> None:
@@ -465,12 +371,8 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         self.misses += 1
         self.slot.kind = Kind.PROBE
         self.slot.start_by = inf
-        pauses = self.timing.retry_pauses
-        if self.misses < self.timing.misses:
-            pause = pauses[min(self.misses, len(pauses)) - 1]
-        else:
-            doubled = 2 ** min(self.misses - self.timing.misses, 16)
-            pause = min(self.timing.backoff * doubled, self.timing.backoff_limit)
+        pause = self.timing.pause_after(self.misses)
+        if self.misses >= self.timing.misses:
             self.set_unavailable(why)
         self.slot.ready = self.slot.due = now + max(pause, self.minimum_pause(now))
 
@@ -513,7 +415,31 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         if was:
             self.updated()
 
-    # -- Orders ------------------------------------------------------------------
+    # -- Orders and ceiling ------------------------------------------------------
+
+    @property
+    def orders(self) -> Orders:
+        """Return the orders that stand."""
+        return self.standing_orders.orders
+
+    @property
+    def orders_expired(self) -> bool:
+        """Return whether the orders were not renewed: then the fail-safe counts."""
+        return self.standing_orders.expired
+
+    @property
+    def valid_orders(self) -> Orders:
+        """Return the orders that stand, their lifetime considered."""
+        return self.standing_orders.valid
+
+    @property
+    def effective_orders(self) -> Orders:
+        """Return the orders that count now: the valid ones under the ceiling."""
+        return self.governance.effective_orders
+
+    def order_to_send(self, change: OrderChange) -> Orders:
+        """Return the orders to send for a change, lifetime and ceiling considered."""
+        return self.governance.under_ceiling(self.standing_orders.valid_target(change))
 
     async def change_orders(self, change: OrderChange) -> None:
         """Change orders; return when the charger has confirmed the orders that stand.
@@ -524,247 +450,9 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         and is sent as soon as the charger answers.
         """
         checked = check_change(change, self.limits)
-        loop = asyncio.get_running_loop()
-        if checked.is_about_now:
-            self._renewals.at[self.config.key] = loop.time()
-            self.orders_expired = False
         if checked.allowed is not None:
             self.governance.allowed_or_stopped()
-        self._requested = checked.apply(self._requested)
-        lowered = cautious(self.orders, checked.apply(self.orders))
-        if lowered != self.orders:
-            self.orders = lowered
-            self.updated()
-            await self._store(lowered)
-        bus = self._bus()
-        pause = checked.allowed is False
-        if pause:
-            bus.supersede(self, lambda waiting: waiting.allowed is True)
-        job = Job(
-            owner=self,
-            kind=Kind.PAUSE if pause else Kind.COMMAND,
-            due=loop.time(),
-            worst_case=bus.worst_case(self),
-            meets=self.slot if self.orders_keep_alive else None,
-            conversation=nothing,
-            persistence=Persistence.STANDING,
-            merge_key=merge_key(checked),
-            change=checked,
-        )
-        # Its change may be another one by its turn: waiting changes are merged.
-        job.conversation = partial(self._apply_change, job)
-        await bus.submit(job)
-
-    async def _apply_change(self, job: Job, turn: Turn) -> None:
-        """Apply the change of a job; let it stand once it is confirmed."""
-        change = job.change or OrderChange()
-        await self.apply(turn, self.order_to_send(change), change)
-        confirmed = self.confirmed_target(change)
-        changed = confirmed != self.orders
-        self.orders = confirmed
-        self.updated()
-        if changed:
-            await self._store(confirmed)
-
-    async def remember(self, name: str, value: str | None) -> None:
-        """Store a note of the protocol with the orders; ``None`` deletes it."""
-        if self.orders.remembered.get(name) == value:
-            return
-        notes = {**self.orders.remembered, name: value}
-        kept = {key: note for key, note in notes.items() if note is not None}
-        self.orders = replace(self.orders, remembered=kept)
-        await self._store(self.orders)
-
-    async def _store(self, orders: Orders) -> None:
-        try:
-            await self.commit(orders)
-        except Exception:
-            # A full disk must not keep a pause from the wire.
-            _LOGGER.exception("%s: orders were not stored", self.config.name)
-
-    def confirmed_target(self, change: OrderChange) -> Orders:
-        """Return the orders that stand once a change under way is confirmed.
-
-        Other changes may have been confirmed meanwhile. A newer lowering stands from
-        the moment of its request, whether or not it has been sent.
-        """
-        return cautious(change.apply(self.orders), self._requested)
-
-    def order_to_send(self, change: OrderChange) -> Orders:
-        """Return the orders to send for a change: its target, unless expired.
-
-        A change of the fail-safe alone renews nothing.
-        """
-        target = self.confirmed_target(change)
-        return self._under_ceiling(expired(target) if self.orders_expired else target)
-
-    def expire_orders(self, now: float) -> bool:
-        """Expire orders whose lifetime is over; return whether they just expired."""
-        lifetime = self.config.order_lifetime
-        if lifetime is None or self.orders_expired:
-            return False
-        # Counted from the first turn, so that automations can renew after a restart.
-        renewed = self._renewals.at.setdefault(self.config.key, now)
-        if now - renewed < lifetime:
-            return False
-        self.orders_expired = True
-        _LOGGER.warning(
-            "%s: no automation has renewed its orders for %g s; "
-            "the fail-safe current counts until one does",
-            self.config.name,
-            lifetime,
-        )
-        self.updated()
-        return True
-
-    # -- The ceiling ---------------------------------------------------------------
-
-    @property
-    def ceiling(self) -> Ceiling | None:
-        """Return the ceiling set last; ``None``: it is not governed."""
-        return self.governance.ceiling
-
-    async def govern(self, safe: float) -> None:
-        """Put it under a ceiling from now on, also after a restart.
-
-        Until one is set (`set_ceiling`), and whenever none is any more, it gets no more
-        than the safe value, A. Raises RefusedOrderError for an unusable number.
-        """
-        checked = number(safe, "safe value")
-        governance, before = self.governance, self._permitted
-        now = asyncio.get_running_loop().time()
-        if governance.ceiling is None:
-            governance.ceiling = Ceiling.first(checked, paused=False)
-        else:
-            governance.ceiling = governance.ceiling.with_safe(checked, now)
-        self._on_ceiling(before)
-        await self.remember(GOVERNED, f"{checked:g}")
-
-    def set_ceiling(self, amperes: float, *, guard: float | None = None) -> None:
-        """Set the ceiling, A, or renew it; it is sent like a limit.
-
-        Does not wait: one charger that is slow or silent must not hold up the others of
-        the house. `setpoint` follows at once, the reading when the charger does.
-        ``guard``: what the main fuse permits, where the ceiling is lower for another
-        reason. Raises RefusedOrderError for an unusable number, or while the charger is
-        not governed.
-        """
-        governance, before = self.governance, self._permitted
-        if governance.ceiling is None:
-            message = f"{self.config.name} is not governed"
-            raise RefusedOrderError(message)
-        now = asyncio.get_running_loop().time()
-        governance.ceiling = governance.ceiling.renew(amperes, guard, now)
-        governance.expired = False
-        self._on_ceiling(before)
-
-    def give_up_ceiling(self) -> None:
-        """Let the ceiling expire now: the house is reloaded, disabled or has failed."""
-        governance, before = self.governance, self._permitted
-        if governance.ceiling is not None:
-            now = asyncio.get_running_loop().time()
-            governance.ceiling = governance.ceiling.give_up(now)
-            governance.expired = True
-            self._on_ceiling(before)
-
-    async def release(self) -> None:
-        """End that it is governed: the house is removed.
-
-        Its orders are lowered to the safe value, and stored; where a ceiling pauses it,
-        it stays stopped. Raising them is the user's word.
-        """
-        governance = self.governance
-        if governance.ceiling is None:
-            return
-        now = asyncio.get_running_loop().time()
-        least = self.limits.minimum
-        stop = governance.amperes(now, least) < least or governance.unproved is not None
-        safe = governance.ceiling.safe
-        self._requested = released(self._requested, safe, stop=stop)
-        self.orders = released(self.orders, safe, stop=stop)
-        notes = dict(self.orders.remembered)
-        for name in (GOVERNED, PAUSED_BY_CEILING):
-            notes.pop(name, None)
-        self.orders = replace(self.orders, remembered=notes)
-        await self._store(self.orders)
-        governance.ceiling = governance.unproved = None
-        governance.allowed_or_stopped()
-        self._send_ceiling(lowers=True)
-        self.updated()
-
-    def expire_ceiling(self, now: float) -> float:
-        """Lower a ceiling that was not renewed; return when it will have to be."""
-        governance = self.governance
-        if governance.ceiling is None or governance.expired:
-            return inf
-        if now < governance.ceiling.expires_at:
-            return governance.ceiling.expires_at
-        governance.expired = True
-        _LOGGER.warning(
-            "%s: the house has set no ceiling in time; no more than %g A until it does",
-            self.config.name,
-            governance.ceiling.amperes(now),
-        )
-        governance.pending = True
-        self._send_ceiling(lowers=True)
-        self.updated()
-        return inf
-
-    @property
-    def _permitted(self) -> Setpoint:
-        """Return the set-point of orders and ceiling, without any share of it."""
-        return clamp(self.effective_orders, self.limits)
-
-    def _on_ceiling(self, before: Setpoint) -> None:
-        """Send a ceiling that changes what counts, or that was not followed yet."""
-        governance, wanted = self.governance, self._permitted
-        changed = wanted.currents != before.currents
-        lowers = all(
-            new <= old
-            for new, old in zip(wanted.currents, before.currents, strict=True)
-        )
-        now = asyncio.get_running_loop().time()
-        if changed or (governance.pending and now >= governance.retry_at):
-            governance.pending = True
-            self._send_ceiling(lowers=lowers)
-        if changed:
-            self.updated()
-
-    def _send_ceiling(self, *, lowers: bool) -> None:
-        """Have the ceiling that counts sent; several that wait are one command."""
-        if self.bus is None:
-            return
-        kind = Kind.PAUSE if self._permitted.paused else Kind.COMMAND
-        waiting = self._ceiling_job
-        if waiting is not None and waiting.waits:
-            waiting.kind = kind
-            waiting.raises = not lowers
-            self.bus.reschedule()
-            return
-        job = Job(
-            owner=self,
-            kind=kind,
-            due=asyncio.get_running_loop().time(),
-            worst_case=self.bus.worst_case(self),
-            meets=self.slot if self.orders_keep_alive else None,
-            conversation=self._follow_ceiling,
-            persistence=Persistence.STANDING,
-            change=OrderChange(),
-            raises=not lowers,
-        )
-        if self.bus.queue(job):
-            self._ceiling_job = job
-
-    async def _follow_ceiling(self, turn: Turn) -> None:
-        governance = self.governance
-        governance.retry_at = turn.now + RETRY
-        wanted = self._permitted
-        await self.follow_ceiling(turn)
-        if self._permitted == wanted:
-            governance.pending = False
-        self.updated()
-
-    # -- Its pause -----------------------------------------------------------------
+        await self.standing_orders.change(checked)
 
     @property
     def holds_ceiling_pause(self) -> bool:
@@ -784,35 +472,6 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
     def continues(self, pause: CeilingPause) -> bool:  # noqa: ARG002
         """Return whether box and visit are provably those of a pause noted before."""
         return False
-
-    @property
-    def serial_read(self) -> str | None:
-        """Return the serial number that was read from the box."""
-        return self.info.serial if self.info is not None else None
-
-    async def keep_ceiling_pause(self) -> None:
-        """Note with its orders that a ceiling has paused it, or no more."""
-        governance = self.governance
-        if governance.ceiling is None or not self.available or self.reading is None:
-            return
-        if governance.unproved is not None:
-            if self.may_be_paused and not self.holds_ceiling_pause:
-                return
-            # There is no pause any more, or it has been proved to be ours.
-            governance.unproved = None
-        noted = self.orders.remembered.get(PAUSED_BY_CEILING)
-        note = noted if self.holds_ceiling_pause else None
-        if self.holds_ceiling_pause and self.is_paused_by_ceiling:
-            known = None if noted is None else CeilingPause.from_note(noted)
-            if known is None or (self.visit is not None and not self.continues(known)):
-                note = CeilingPause(self.serial_read, self.visit).note
-        await self.remember(PAUSED_BY_CEILING, note)
-
-    @property
-    def is_paused_by_ceiling(self) -> bool:
-        """Return whether the ceiling alone allows no current."""
-        valid = clamp(self.valid_orders, self.limits)
-        return not valid.paused and self._permitted.paused
 
     # -- Commands ----------------------------------------------------------------
 
@@ -868,7 +527,7 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         Raises what the conversation raises, NotConfirmedError (see `rest`),
         NotAvailableError and LineLostError.
         """
-        bus = self._bus()
+        bus = self.require_bus()
         job = Job(
             owner=self,
             kind=kind,
@@ -879,7 +538,23 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         )
         return await bus.submit(job)  # type: ignore[return-value] # the job's own
 
-    def _bus(self) -> Scheduler:
+    def order_job(
+        self, conversation: Conversation[object], change: OrderChange, kind: Kind
+    ) -> Job:
+        """Return a command that sends orders; raises NotAvailableError on no bus."""
+        return Job(
+            owner=self,
+            kind=kind,
+            due=asyncio.get_running_loop().time(),
+            worst_case=self.require_bus().worst_case(self),
+            meets=self.slot if self.orders_keep_alive else None,
+            conversation=conversation,
+            persistence=Persistence.STANDING,
+            change=change,
+        )
+
+    def require_bus(self) -> Scheduler[Charger]:
+        """Return its bus; raises NotAvailableError while it is on none."""
         if self.bus is None:
             message = f"{self.config.name} is on no bus"
             raise NotAvailableError(message)
@@ -931,17 +606,6 @@ class Charger[C: ChargerConfig = ChargerConfig](Observable, ABC):
         self.notice(Fault.CHARGES_ALTHOUGH_PAUSED, present=against)
 
 
-def _reason_of(valid: Orders, effective: Orders, limits: Limits) -> PauseReason | None:
-    """Return why orders let no car charge, by themselves or under the ceiling."""
-    if (reason := pause_reason(valid, limits)) is not None:
-        return reason
-    return PauseReason.CEILING_TOO_LOW if pause_reason(effective, limits) else None
-
-
 def _accept(_serial: str) -> bool:
     """Accept any box: the default for a script."""
     return True
-
-
-async def _no_commit(_orders: Orders) -> None:
-    """Store nothing: the default for a script without a store."""

@@ -55,6 +55,13 @@ class Timing:
     attempts: int = 3
     """How often a command that may be repeated is sent."""
 
+    def pause_after(self, misses: int) -> float:
+        """Return the pause after so many unanswered requests in a row, s."""
+        if misses < self.misses:
+            return self.retry_pauses[min(misses, len(self.retry_pauses)) - 1]
+        doubled = 2.0 ** min(misses - self.misses, 16)
+        return min(self.backoff * doubled, self.backoff_limit)
+
 
 class Frame(ABC):
     """One frame with good checksums, as a protocol sees it."""

@@ -26,8 +26,11 @@ _LOGGER = logging.getLogger(__name__)
 class JobOwner(Protocol):
     """The charger of a job."""
 
-    orders: Orders
     statistics: ChargerStatistics
+
+    @property
+    def orders(self) -> Orders:
+        """Return the orders that stand."""
 
     @property
     def bursts(self) -> bool:

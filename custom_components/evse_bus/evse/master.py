@@ -8,7 +8,7 @@ master may silence the whole bus.
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 
-from .charger import Charger, Scheduler
+from .charger import Charger
 from .errors import NotAvailableError
 from .exchange import Turn
 from .framing import Frame
@@ -16,13 +16,14 @@ from .listeners import Observable
 from .memory import LineMemory
 from .model import Circuit, Fault
 from .schedule import Kind, Slot
+from .scheduler import Scheduler
 from .statistics import ChargerStatistics
 
 
 class ChargerGroup:
     """The owner of the state that all chargers of one bus have in common."""
 
-    bus: Scheduler | None = None
+    bus: Scheduler[Charger] | None = None
     """The bus; set by it."""
 
     def resume(self, memory: LineMemory) -> None:

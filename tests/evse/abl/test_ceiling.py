@@ -101,10 +101,10 @@ class Trial:
         match name:
             case "ceiling":
                 self.house.says(value)
-                self.charger.set_ceiling(value)
+                self.charger.governance.set_ceiling(value)
             case "give up":
                 self.house.falls_silent()
-                self.charger.give_up_ceiling()
+                self.charger.governance.give_up_ceiling()
             case "restart":
                 await self.restart()
             case _:
@@ -159,7 +159,7 @@ class Trial:
         self.charger: AblCharger = self.scene.add(
             config(poll_interval=2.0), self.stored
         )
-        self.charger.commit = commit
+        self.charger.standing_orders.commit = commit
 
     async def run(
         self, acts: list[tuple[tuple[str, float], float]], last: float
@@ -167,7 +167,7 @@ class Trial:
         async with Scene(self.box) as scene:
             self.scene = scene
             self.put()
-            await self.charger.govern(SAFE)
+            await self.charger.governance.begin(SAFE)
             for (name, value), wait in acts:
                 await self.act(name, value)
                 await asyncio.sleep(wait)
@@ -221,8 +221,8 @@ async def governed(
 ) -> AblCharger:
     charger = await scene.settled(config(), orders(16, allowed=allowed))
     await scene.stop_polls(charger)
-    await charger.govern(SAFE)
-    charger.set_ceiling(16.0)
+    await charger.governance.begin(SAFE)
+    charger.governance.set_ceiling(16.0)
     await until(lambda: box.ic_amps == pytest.approx(16.0, abs=0.1))
     return charger
 
@@ -237,11 +237,11 @@ async def test_a_ceiling_goes_down_and_up_without_a_poll() -> None:
     box = AblBox(1, car=plugged())
     async with Scene(box) as scene:
         charger = await governed(scene, box)
-        charger.set_ceiling(0.0)
+        charger.governance.set_ceiling(0.0)
         await until(lambda: box.ic_amps == 0)
         assert charger.pause_reason is PauseReason.CEILING_TOO_LOW
         await until(lambda: NOTE in charger.orders.remembered)
-        charger.set_ceiling(10.0)
+        charger.governance.set_ceiling(10.0)
         await until(lambda: box.ic_amps == pytest.approx(10.0, abs=0.1))
         assert charger.pause_reason is None
         await until(lambda: NOTE not in charger.orders.remembered)
@@ -257,9 +257,9 @@ async def test_the_pause_of_another_stays() -> None:
     async with Scene(box) as scene:
         charger = await governed(scene, box)
         box.set_by_other_master(0)
-        charger.set_ceiling(0.0)
+        charger.governance.set_ceiling(0.0)
         await asyncio.sleep(5)
-        charger.set_ceiling(16.0)
+        charger.governance.set_ceiling(16.0)
         await asyncio.sleep(15)
         assert box.ic_amps == 0
         assert charger.pause_reason is PauseReason.NOT_ALLOWED
@@ -271,10 +271,10 @@ async def test_an_outlet_that_is_disabled_meanwhile_is_not_enabled() -> None:
     box = AblBox(1, car=plugged())
     async with Scene(box) as scene:
         charger = await governed(scene, box)
-        charger.set_ceiling(0.0)
+        charger.governance.set_ceiling(0.0)
         await until(lambda: box.ic_amps == 0)
         box.stop_locally()
-        charger.set_ceiling(16.0)
+        charger.governance.set_ceiling(16.0)
         await asyncio.sleep(15)
         assert box.state == "E0"
         assert scene.writes(STATE) == []
@@ -286,12 +286,12 @@ async def test_a_pause_of_an_earlier_run_waits_for_the_user() -> None:
     async with Scene(trial.box) as scene:
         trial.scene = scene
         trial.put()
-        await trial.charger.govern(SAFE)
-        trial.charger.set_ceiling(0.0)
+        await trial.charger.governance.begin(SAFE)
+        trial.charger.governance.set_ceiling(0.0)
         await until(lambda: NOTE in trial.stored.remembered)
         await trial.restart()
         await until(lambda: trial.charger.available)
-        trial.charger.set_ceiling(16.0)
+        trial.charger.governance.set_ceiling(16.0)
         await asyncio.sleep(15)
         assert trial.box.ic_amps == 0
         assert trial.charger.pause_reason is PauseReason.WAITS_FOR_USER
@@ -310,14 +310,14 @@ async def test_a_ceiling_does_not_end_the_pause_of_an_order() -> None:
         charger = await scene.settled(
             config(order_lifetime=20.0), orders(16, allowed=True, fail_safe=8)
         )
-        await charger.govern(SAFE)
-        charger.set_ceiling(16.0)
+        await charger.governance.begin(SAFE)
+        charger.governance.set_ceiling(16.0)
         await charger.change_orders(OrderChange(current=0.0))
         assert box.ic_amps == 0
         await until(lambda: charger.orders_expired, 30)
-        charger.set_ceiling(0.0)
+        charger.governance.set_ceiling(0.0)
         await asyncio.sleep(2)
-        charger.set_ceiling(16.0)
+        charger.governance.set_ceiling(16.0)
         await asyncio.sleep(15)
         assert box.ic_amps == 0
         await charger.change_orders(OrderChange(current=10.0))

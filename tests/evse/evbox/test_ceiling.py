@@ -49,7 +49,7 @@ class GovernedTrial(Trial):
         async def commit(orders: Orders) -> None:
             self.stored = orders
 
-        self.charger.commit = commit
+        self.charger.standing_orders.commit = commit
 
     @override
     def check(self, order: Order) -> None:
@@ -62,14 +62,14 @@ class GovernedTrial(Trial):
 
     async def do_ceiling(self, value: float) -> None:
         self.house.says(value)
-        self.charger.set_ceiling(value)
+        self.charger.governance.set_ceiling(value)
 
     async def do_silence(self, _value: float) -> None:
         await asyncio.sleep(61.0)
 
     async def do_give_up(self, _value: float) -> None:
         self.house.falls_silent()
-        self.charger.give_up_ceiling()
+        self.charger.governance.give_up_ceiling()
 
     async def do_restart(self, _value: float) -> None:
         await asyncio.gather(*self.tasks)
@@ -90,7 +90,7 @@ class GovernedTrial(Trial):
 
     @override
     async def run(self, acts: list[Act]) -> None:
-        await self.charger.govern(SAFE)
+        await self.charger.governance.begin(SAFE)
         await super().run(acts)
 
     async def settle(self, value: float) -> None:
@@ -148,7 +148,7 @@ def play(acts: object, *, orders: Orders | None = None, interval: int = 0) -> Sc
                 orders=orders or Orders(limit=CurrentLimit(current=16.0)),
                 poll_interval=17.0,
             )
-            await charger.govern(SAFE)
+            await charger.governance.begin(SAFE)
             await asyncio.sleep(5.0)
             await acts(stage, charger)  # type: ignore[operator]
 
@@ -158,15 +158,15 @@ def play(acts: object, *, orders: Orders | None = None, interval: int = 0) -> Sc
 
 def test_a_lower_ceiling_is_sent_at_once_and_changes_no_order() -> None:
     async def acts(stage: Scene, charger: EvboxCharger) -> None:
-        charger.set_ceiling(13.0)
+        charger.governance.set_ceiling(13.0)
         await asyncio.sleep(0.5)
         assert stage.line.orders[-1].limits[0] == 13.0
         sent = len(stage.line.sent)
-        charger.set_ceiling(10.0)
-        charger.set_ceiling(9.0)
+        charger.governance.set_ceiling(10.0)
+        charger.governance.set_ceiling(9.0)
         await asyncio.sleep(0.5)
         assert [one.limits[0] for one in stage.line.orders[sent:]] == [9.0], "merged"
-        charger.set_ceiling(9.0)
+        charger.governance.set_ceiling(9.0)
         await asyncio.sleep(0.5)
         assert len(stage.line.sent) == sent + 1, "a renewal sends nothing"
         assert charger.orders.limit.current == 16.0
@@ -176,14 +176,14 @@ def test_a_lower_ceiling_is_sent_at_once_and_changes_no_order() -> None:
 
 def test_a_ceiling_below_the_minimum_is_a_pause_with_its_own_reason() -> None:
     async def acts(stage: Scene, charger: EvboxCharger) -> None:
-        charger.set_ceiling(5.9)
+        charger.governance.set_ceiling(5.9)
         assert charger.pause_reason is PauseReason.CEILING_TOO_LOW
         assert charger.setpoint.paused
         await asyncio.sleep(0.5)
         assert stage.line.orders[-1].limits == (0, 0, 0)
         assert stage.line.orders[-1].fallback == (0, 0, 0)
         assert NOTE in charger.orders.remembered
-        charger.set_ceiling(6.0)
+        charger.governance.set_ceiling(6.0)
         await asyncio.sleep(0.5)
         assert stage.line.orders[-1].limits == (6, 6, 6)
         assert stage.line.orders[-1].fallback == (6, 6, 6)
@@ -196,16 +196,16 @@ def test_a_ceiling_below_the_minimum_is_a_pause_with_its_own_reason() -> None:
 @pytest.mark.parametrize("safe_at_start", [0.0, SAFE])
 def test_an_expired_ceiling_goes_down_by_itself(safe_at_start: float) -> None:
     async def acts(stage: Scene, charger: EvboxCharger) -> None:
-        await charger.govern(safe_at_start)
+        await charger.governance.begin(safe_at_start)
         # Between two polls.
         await asyncio.sleep(7.0)
-        charger.set_ceiling(16.0)
+        charger.governance.set_ceiling(16.0)
         await asyncio.sleep(59.9)
         assert stage.line.orders[-1].limits[0] == 16.0
         await asyncio.sleep(0.3)
         assert stage.line.orders[-1].limits[0] == safe_at_start
         # A higher safe value raises nothing while the house is silent.
-        await charger.govern(32.0)
+        await charger.governance.begin(32.0)
         await asyncio.sleep(30.0)
         assert stage.line.orders[-1].limits[0] == safe_at_start
 
@@ -214,7 +214,7 @@ def test_an_expired_ceiling_goes_down_by_itself(safe_at_start: float) -> None:
 
 def test_a_pause_by_the_switch_has_no_fail_safe_either() -> None:
     async def acts(stage: Scene, charger: EvboxCharger) -> None:
-        charger.set_ceiling(16.0)
+        charger.governance.set_ceiling(16.0)
         await charger.change_orders(OrderChange(allowed=False))
         assert stage.line.orders[-1].fallback == (0, 0, 0)
 
@@ -223,9 +223,9 @@ def test_a_pause_by_the_switch_has_no_fail_safe_either() -> None:
 
 def test_a_house_that_is_removed_leaves_no_more_than_the_safe_value() -> None:
     async def acts(stage: Scene, charger: EvboxCharger) -> None:
-        charger.set_ceiling(12.0)
+        charger.governance.set_ceiling(12.0)
         await asyncio.sleep(1.0)
-        await charger.release()
+        await charger.governance.release()
         await asyncio.sleep(25.0)
         assert stage.line.orders[-1].limits[0] == SAFE
         assert charger.orders == replace(
@@ -240,9 +240,9 @@ def test_a_house_that_is_removed_leaves_no_more_than_the_safe_value() -> None:
 
 def test_one_that_is_paused_stays_stopped_when_the_house_is_removed() -> None:
     async def acts(stage: Scene, charger: EvboxCharger) -> None:
-        charger.set_ceiling(0.0)
+        charger.governance.set_ceiling(0.0)
         await asyncio.sleep(1.0)
-        await charger.release()
+        await charger.governance.release()
         assert charger.orders.allowed is False
         await charger.change_orders(OrderChange(current=16.0))
         assert stage.line.orders[-1].limits[0] == 0.0
@@ -253,13 +253,13 @@ def test_one_that_is_paused_stays_stopped_when_the_house_is_removed() -> None:
 @pytest.mark.parametrize("value", [-1.0, float("nan"), inf, True])
 def test_an_unusable_ceiling_is_refused(value: float) -> None:
     async def acts(stage: Scene, charger: EvboxCharger) -> None:
-        charger.set_ceiling(9.0)
+        charger.governance.set_ceiling(9.0)
         with pytest.raises(RefusedOrderError):
-            charger.set_ceiling(value)
+            charger.governance.set_ceiling(value)
         assert charger.setpoint.current == 9.0
         free = stage.add(7)
         with pytest.raises(RefusedOrderError):
-            free.set_ceiling(16.0)
+            free.governance.set_ceiling(16.0)
 
     play(acts)
 
@@ -269,8 +269,8 @@ def test_the_first_request_after_a_restart_knows_of_the_house(*, paused: bool) -
     async def scene() -> None:
         trial = GovernedTrial(35.0)
         async with trial.scene:
-            await trial.charger.govern(SAFE)
-            trial.charger.set_ceiling(0.0 if paused else 16.0)
+            await trial.charger.governance.begin(SAFE)
+            trial.charger.governance.set_ceiling(0.0 if paused else 16.0)
             await asyncio.sleep(5.0)
             sent = len(trial.scene.line.sent)
             await trial.do_restart(0.0)
@@ -278,7 +278,7 @@ def test_the_first_request_after_a_restart_knows_of_the_house(*, paused: bool) -
             highest = max(one.limits[0] for one in trial.scene.line.orders[sent:])
             assert highest == (0.0 if paused else SAFE)
             assert trial.charger.orders.limit.current == 16.0
-            trial.charger.set_ceiling(12.0)
+            trial.charger.governance.set_ceiling(12.0)
             await asyncio.sleep(5.0)
             assert trial.scene.line.orders[-1].limits[0] == 12.0
             await trial.scene.bus.stop()

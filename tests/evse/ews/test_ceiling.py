@@ -77,7 +77,7 @@ class Trial:
         async def commit(stored: Orders) -> None:
             self.stored = stored
 
-        self.charger.commit = commit
+        self.charger.standing_orders.commit = commit
 
     def loses(self, name: str) -> bool:
         if name not in self.lost:
@@ -132,10 +132,10 @@ class Trial:
         match name:
             case "ceiling":
                 self.house.says(value)
-                self.charger.set_ceiling(value)
+                self.charger.governance.set_ceiling(value)
             case "give up":
                 self.house.falls_silent()
-                self.charger.give_up_ceiling()
+                self.charger.governance.give_up_ceiling()
             case "restart":
                 await self.restart()
             case "limit":
@@ -194,7 +194,7 @@ def test_permission_and_ceiling(
             await scene.plug()
         trial.limit.set(16.0)
         trial.house.governs(SAFE)
-        await trial.charger.govern(SAFE)
+        await trial.charger.governance.begin(SAFE)
         for (name, value), wait in acts:
             await trial.act(name, value)
             await asyncio.sleep(wait)
@@ -223,7 +223,7 @@ def test_a_ceiling_pauses_and_resumes() -> None:
         trial = Trial(scene, allowed=True, may_start=True)
         await scene.charge()
         trial.house.governs(SAFE)
-        await trial.charger.govern(SAFE)
+        await trial.charger.governance.begin(SAFE)
         await trial.act("ceiling", 5.0)
         await scene.until(lambda: scene.status() not in CHARGES, 5)
         await scene.until(lambda: NOTE in trial.stored.remembered, 5)
@@ -247,7 +247,7 @@ def test_a_car_that_waits_for_its_start_is_not_started_by_a_ceiling() -> None:
         trial = Trial(scene)
         await scene.plug()
         trial.house.governs(SAFE)
-        await trial.charger.govern(SAFE)
+        await trial.charger.governance.begin(SAFE)
         await trial.settle(0.0, 20)
         await trial.settle(16.0, 30)
         assert not scene.line.orders()
@@ -273,7 +273,7 @@ def test_a_pause_of_an_earlier_run(*, same: bool) -> None:
         await scene.charge()
         await asyncio.sleep(60)
         trial.house.governs(SAFE)
-        await trial.charger.govern(SAFE)
+        await trial.charger.governance.begin(SAFE)
         await trial.settle(0.0, 20)
         assert NOTE in trial.stored.remembered
         if not same:

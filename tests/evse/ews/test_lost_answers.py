@@ -295,7 +295,7 @@ def test_a_power_failure_with_a_start_of_its_own() -> None:
 def test_a_power_failure_with_a_start_of_its_own_against_a_pause() -> None:
     async def acts(scene: EwsScene) -> None:
         await scene.charge()
-        scene.charger().orders = OFF.apply(scene.charger().orders)
+        scene.charger().standing_orders.orders = OFF.apply(scene.charger().orders)
         scene.box.power_cycle(0.1)
         await scene.until(lambda: "power failure" in scene.starts())
         await scene.until(lambda: scene.status() in (0x50, 0x42))

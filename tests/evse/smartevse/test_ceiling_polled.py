@@ -82,7 +82,7 @@ class Trial:
             self.stored = stored
 
         self.stored: object = self.scene.charger.orders
-        self.scene.charger.commit = commit  # type: ignore[assignment]
+        self.scene.charger.standing_orders.commit = commit  # type: ignore[assignment]
 
     @property
     def permitted(self) -> float:
@@ -136,10 +136,10 @@ class Trial:
         match name:
             case "ceiling":
                 self.house.says(value)
-                scene.charger.set_ceiling(value)
+                scene.charger.governance.set_ceiling(value)
             case "give up":
                 self.house.falls_silent()
-                scene.charger.give_up_ceiling()
+                scene.charger.governance.give_up_ceiling()
             case "restart":
                 await self.restart()
             case "limit":
@@ -205,7 +205,7 @@ def test_permission_and_ceiling(
             scene.car.plug_in()
             await scene.settled()
             trial.house.governs(SAFE)
-            await scene.charger.govern(SAFE)
+            await scene.charger.governance.begin(SAFE)
             for (name, value), wait in acts:
                 await trial.act(name, value)
                 await asyncio.sleep(wait)
@@ -233,7 +233,7 @@ def test_a_ceiling_pauses_and_resumes(dialect: Dialect) -> None:
         trial = Trial(scene)
         await scene.charge()
         trial.house.governs(SAFE)
-        await scene.charger.govern(SAFE)
+        await scene.charger.governance.begin(SAFE)
         await trial.settle(12.0, 20)
         assert scene.box.offers == 12
         await trial.settle(0.0, 20)
@@ -260,7 +260,7 @@ def test_access_that_was_closed_at_the_box_stays_closed(dialect: Dialect) -> Non
         trial = Trial(scene)
         await scene.charge()
         trial.house.governs(SAFE)
-        await scene.charger.govern(SAFE)
+        await scene.charger.governance.begin(SAFE)
         await trial.settle(16.0, 20)
         scene.outlet.set_access(False)
         await scene.polled()
@@ -279,7 +279,7 @@ def test_access_opened_at_the_box_is_the_drivers_word(dialect: Dialect) -> None:
         trial = Trial(scene)
         await scene.charge()
         trial.house.governs(SAFE)
-        await scene.charger.govern(SAFE)
+        await scene.charger.governance.begin(SAFE)
         await trial.settle(0.0, 20)
         closed = len(scene.accesses())
         await trial.act("access on", 0.0)
@@ -290,7 +290,7 @@ def test_access_opened_at_the_box_is_the_drivers_word(dialect: Dialect) -> None:
         assert scene.charger.setpoint.current == MINIMUM_CURRENT
         # The fuse is stronger.
         for _ in range(3):
-            scene.charger.set_ceiling(0.0, guard=0.0)
+            scene.charger.governance.set_ceiling(0.0, guard=0.0)
             await asyncio.sleep(10)
         assert scene.box.offers == 0
         assert not scene.outlet.access
@@ -312,7 +312,7 @@ def test_the_switch_is_stronger_than_the_drivers_word() -> None:
         trial = Trial(scene)
         await scene.charge()
         trial.house.governs(SAFE)
-        await scene.charger.govern(SAFE)
+        await scene.charger.governance.begin(SAFE)
         await trial.settle(0.0, 20)
         await trial.act("access on", 0.0)
         await trial.settle(0.0, 20)
@@ -331,7 +331,7 @@ def test_a_pause_of_an_earlier_run_waits_for_the_user(dialect: Dialect) -> None:
         trial = Trial(scene)
         await scene.charge()
         trial.house.governs(SAFE)
-        await scene.charger.govern(SAFE)
+        await scene.charger.governance.begin(SAFE)
         await trial.settle(0.0, 20)
         await trial.restart()
         await trial.settle(16.0, 40)

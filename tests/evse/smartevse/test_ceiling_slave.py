@@ -137,10 +137,10 @@ class Trial:
         match name:
             case "ceiling":
                 self.house.says(value)
-                self.slave.set_ceiling(value)
+                self.slave.governance.set_ceiling(value)
             case "give up":
                 self.house.falls_silent()
-                self.slave.give_up_ceiling()
+                self.slave.governance.give_up_ceiling()
             case "limit":
                 self.limit.set(value)
                 self.change(OrderChange(current=value))
@@ -167,7 +167,7 @@ async def charging(scene: MasterScene) -> Trial:
     trial = Trial(scene)
     await scene.until(lambda: trial.slave.configuration is not None)
     trial.house.governs(SAFE)
-    await trial.slave.govern(SAFE)
+    await trial.slave.governance.begin(SAFE)
     await trial.act("ceiling", 12.0)
     await scene.charge(2)
     await trial.settle(12.0, 20)
@@ -216,7 +216,7 @@ def test_a_ceiling_pauses_and_resumes(dialect: str) -> None:
         scene = scene_of(dialect)
         async with scene:
             trial = await charging(scene)
-            trial.slave.set_ceiling(0.0)
+            trial.slave.governance.set_ceiling(0.0)
             assert trial.slave.pause_reason is PauseReason.CEILING_TOO_LOW
             await trial.settle(0.0, 20)
             assert trial.box.offers == 0
@@ -269,7 +269,7 @@ def test_access_opened_at_the_box_is_the_drivers_word(dialect: str) -> None:
             assert trial.accesses == [False]
             # The fuse is stronger.
             for _ in range(3):
-                trial.slave.set_ceiling(0.0, guard=0.0)
+                trial.slave.governance.set_ceiling(0.0, guard=0.0)
                 await asyncio.sleep(10)
             assert trial.box.offers == 0
             # It ends with the visit.

@@ -201,7 +201,7 @@ class AblCharger(AblWriter):
             paused = self.box.writes.code == PAUSE
             if not paused or self.order_to_send(change).allowed is False:
                 await self.note_pause(by_limit=False)
-            elif change.allowed is None and self.is_paused_by_ceiling:
+            elif change.allowed is None and self.governance.pauses:
                 await self._note_ceiling_pause(was_open=was_open)
             else:
                 await self.note_pause(by_limit=True)
@@ -294,7 +294,7 @@ class AblCharger(AblWriter):
             # The orders may have changed since.
             if self.box.writes.code != PAUSE or not by_limit:
                 return
-            if self.is_paused_by_ceiling:
+            if self.governance.pauses:
                 await self._note_ceiling_pause(was_open=was_open)
             elif not was_paused:
                 await self.note_pause(by_limit=True)

@@ -485,7 +485,7 @@ class AblReader(Charger[AblConfig]):
             # It has ended: a later pause is not ours.
             await self.note_pause(by_limit=False)
         if self.serial is not None:
-            await self.remember(REPORTS_ICMAX, self.serial)
+            await self.standing_orders.remember(REPORTS_ICMAX, self.serial)
 
     async def _read_icmax(self, turn: Turn) -> Icmax:
         """Read 0x000F; what is neither known nor just written is read twice."""
@@ -554,4 +554,6 @@ class AblReader(Charger[AblConfig]):
     async def note_pause(self, *, by_limit: bool) -> None:
         """Note who has paused the box, also for the time after a restart."""
         self.limit_paused = by_limit
-        await self.remember(PAUSED_BY_LIMIT, self.serial if by_limit else None)
+        await self.standing_orders.remember(
+            PAUSED_BY_LIMIT, self.serial if by_limit else None
+        )

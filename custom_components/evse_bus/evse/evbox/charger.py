@@ -310,7 +310,11 @@ class EvboxCharger(Charger[EvboxConfig]):
     @override
     def holds_ceiling_pause(self) -> bool:
         confirmed = self._confirmed
-        return confirmed is not None and confirmed.paused and self._permitted.paused
+        return (
+            confirmed is not None
+            and confirmed.paused
+            and self.governance.permitted.paused
+        )
 
     def _match_reply(self, frame: EvboxFrame) -> Reply | None:
         """Return the reply to our request; ``None``: the frame is another."""

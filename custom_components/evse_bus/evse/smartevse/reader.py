@@ -373,7 +373,7 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
             other = self.must_close_access or restarted
             opened = self._closed_by_us and not other
             self._closed_by_us = False
-            if opened and self.waits_for_current and self.is_paused_by_ceiling:
+            if opened and self.waits_for_current and self.governance.pauses:
                 self.governance.driver_allows = True
         if plugged is False:
             self.governance.driver_allows = False
