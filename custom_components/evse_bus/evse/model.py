@@ -115,6 +115,8 @@ class PauseReason(StrEnum):
     """Installation, charger or cable carry less than the charger's minimum."""
     SUPPLY_TOO_LOW = "supply_too_low"
     """Its part of the shared supply is below the minimum."""
+    OTHER_NOT_READ = "other_not_read"
+    """Another box of the bus was not read yet, and might be charging for ever."""
     CEILING_TOO_LOW = "ceiling_too_low"
     """The house permits less than the minimum: its sun, or its main fuse."""
     WAITS_FOR_USER = "waits_for_user"

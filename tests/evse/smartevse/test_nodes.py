@@ -672,10 +672,32 @@ def test_nobody_begins_beside_one_that_was_never_read_and_may_go_on_for_ever(
             assert scene.offers == 0
             # It is neither granted nor refused: it need not wait for a minute.
             assert states(scene, 2) == []
+            slave = scene.slave(2)
+            assert slave.pause_reason is PauseReason.OTHER_NOT_READ
             scene.line.boxes[3] = box
             begin = now()
             await scene.until(lambda: scene.offers == 16)
             assert now() - begin < 45
+            assert slave.pause_reason is None
+
+    simulate(scene())
+
+
+def test_only_who_may_not_begin_waits_for_another_to_be_read() -> None:
+    """Not one that charges, nor where the other must have stopped by itself."""
+
+    async def scene() -> None:
+        async with scene_of("3.8") as scene:
+            await charging(scene, 2)
+            scene.add(3)
+            await asyncio.sleep(30)
+            assert scene.master.waits_for_unread(2)
+            assert scene.offers > 0
+            assert scene.slave(2).pause_reason is None
+        async with scene_of("2.30", units=(2, 3), kept=Dialect.V2_30) as scene:
+            scene.line.boxes.pop(3)
+            await asyncio.sleep(5)
+            assert scene.slave(2).pause_reason is None
 
     simulate(scene())
 

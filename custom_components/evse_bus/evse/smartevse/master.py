@@ -274,6 +274,16 @@ class Master(BusMaster):
         """Return the current that the others leave for a unit now, 0.1 A."""
         return room(unit, self._limit, self._all_draws(), self.now)
 
+    def waits_for_unread(self, unit: int) -> bool:
+        """Return whether it may not begin before another was read, however long."""
+        if self._phase is not _Phase.BROADCASTING:
+            return False
+        others = (draw for one, draw in self._all_draws().items() if one != unit)
+        now = self.now
+        return any(
+            not draw.row.fail_safe_proven and draw.most(now) == inf for draw in others
+        )
+
     def grant(self, unit: int) -> int:
         """Return the current that may be granted to this unit now, 0.1 A; 0: none."""
         share = self.shares().get(unit, 0)

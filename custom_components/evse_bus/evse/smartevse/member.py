@@ -26,6 +26,9 @@ class Balancer(Protocol):
     def room(self, unit: int) -> float:
         """Return the current that the others leave for a unit now, 0.1 A."""
 
+    def waits_for_unread(self, unit: int) -> bool:
+        """Return whether it may not begin before another was read, however long."""
+
     def grant(self, unit: int) -> int:
         """Return the current that may be granted to this unit now, 0.1 A; 0: none."""
 

@@ -259,8 +259,14 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Member):
     @property
     @override
     def pause_reason(self) -> PauseReason | None:
-        withheld = PauseReason.SUPPLY_TOO_LOW if self.withheld else None
-        return super().pause_reason or withheld
+        if (reason := super().pause_reason) is not None:
+            return reason
+        if self.withheld:
+            return PauseReason.SUPPLY_TOO_LOW
+        if self._master is None or self.status is None or self._charges:
+            return None
+        waits = self._master.waits_for_unread(self.unit)
+        return PauseReason.OTHER_NOT_READ if waits else None
 
     # -- Its share -----------------------------------------------------------------
 
