@@ -4,14 +4,16 @@ The witness looks at the virtual boxes alone: what their pilots offer while the
 contactors are closed, when a contactor closes, and which registers were written.
 """
 
+import asyncio
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from random import Random
 from typing import Literal, override
 
-from custom_components.evse_bus.evse.errors import LineLostError
+from custom_components.evse_bus.evse.errors import EvseError, LineLostError
 from custom_components.evse_bus.evse.model import (
+    MINIMUM_CURRENT,
     Circuit,
     CurrentLimit,
     OrderChange,
@@ -48,14 +50,20 @@ KEPT: Mapping[str, KeptDialect] = {
 }
 """The names of the library."""
 
-CROSSED = 2.5
-"""A grant may have been on its way when access was turned off at the box, s."""
+CROSSED = 1.0
+"""A grant may have been on its way when a start was forbidden, s."""
 SETTLES = 4.0
 """A lower supply counts once each box has received two broadcasts, s."""
 LETS_GO = 8.0
 """C1: PWM off, contactor closed for up to 7 s, until the car lets go, s."""
 RETURNS = 90.0
 """After another master: 60 s of silence, and what its boxes go on with, s."""
+SETTLED = 12.0
+"""After that long with broadcasts, and all well, each order is obeyed, s."""
+PATIENCE = 60.0
+"""Longest wait for that: a bus begins anew, and reads its boxes first, s."""
+STANDING = 20.0
+"""A command may be carried out so long after it was given, s."""
 EPSILON = 1e-6
 
 
@@ -85,6 +93,11 @@ class BoxSpec:
     modem: int = 0
     kept: bool = False
     """Its dialect is known from earlier."""
+    allowed: bool = True
+    limit: float = 32.0
+    """Its orders at the beginning: whether it may charge, and with how much, A."""
+    access: bool = True
+    """At the beginning, as its switch has it."""
 
     @property
     def row(self) -> Dialect:
@@ -129,6 +142,8 @@ class BoxSpec:
         controller.answers_as_before = self.late == "before"
         if not isinstance(controller.outlet, SmartEvseOutlet3):
             controller.outlet.second *= self.second
+        if not self.access:
+            controller.outlet.set_access(allowed=False)
         return Box(controller, car, delay=self.delay)
 
 
@@ -139,16 +154,26 @@ class Watch:
     closed: bool = False
     offered: float = 0.0
     """Its last PWM while the contactor was closed, A."""
-    allowed: bool | None = True
-    """The order that was confirmed; ``None``: one is under way, or was not confirmed."""
+    allowed: bool = True
+    """The newest order: a pause forbids a start at once, confirmed or not."""
     limits: tuple[float, ...] = (16.0,)
-    """That which was confirmed, or all that may count, A."""
+    """The limit that was confirmed, or all that may count, the newest last, A."""
+    forbidden_since: float = float("-inf")
+    """Neither of these has let it begin since then."""
     off_since: float | None = None
     """Access was turned off at the box."""
+    on_at: float = float("-inf")
+    """The last order that it may charge."""
+    writes: int = 0
+    """Number of those that were looked at."""
 
     @property
     def limit(self) -> float:
         return max(self.limits)
+
+    @property
+    def may_begin(self) -> bool:
+        return self.allowed and self.limits[-1] >= MINIMUM_CURRENT
 
 
 @dataclass
@@ -167,13 +192,19 @@ class MixScene(MasterScene):
     _old_supply: float = field(init=False, default=0.0)
     _lowered_at: float = field(init=False, default=float("-inf"))
     _broadcast_at: float = field(init=False, default=float("-inf"))
+    _broadcasts_since: float = field(init=False, default=float("inf"))
     _other_since: float | None = field(init=False, default=None)
     _other_until: float = field(init=False, default=float("-inf"))
 
     @override
     def plug_box(self, unit: int, dialect: str | None = None) -> Box:
         box = self.line.boxes[unit] = self.specs[unit].plug(unit)
-        self.watched[unit] = Watch(limits=(self.current,))
+        spec = self.specs[unit]
+        self.watched[unit] = Watch(
+            allowed=spec.allowed,
+            limits=(spec.limit,),
+            off_since=None if spec.access else now(),
+        )
         return box
 
     @override
@@ -186,7 +217,7 @@ class MixScene(MasterScene):
             installation_limit=INSTALLATION,
             dialect=self.found.get(unit, KEPT[spec.dialect] if spec.kept else None),
         )
-        usual = {"limit": CurrentLimit(current=self.current), "allowed": self.allowed}
+        usual = {"limit": CurrentLimit(current=spec.limit), "allowed": spec.allowed}
         return SlaveSmartEvse(config, Orders(**(usual | orders)))  # type: ignore[arg-type]
 
     async def restart(self, *, reload: bool) -> None:
@@ -206,14 +237,18 @@ class MixScene(MasterScene):
     # -- What is done to it --------------------------------------------------------
 
     async def order(self, unit: int, change: OrderChange) -> None:
-        """Change orders; they count for the witness once they were confirmed."""
+        """Change orders: a limit counts once it was confirmed, a pause at once."""
         watch = self.watched[unit]
+        could_begin = watch.may_begin
         if change.allowed is not None:
-            watch.allowed = True if change.allowed else None
+            watch.allowed = change.allowed
+        if change.allowed:
+            watch.on_at = now()
         if change.current is not None:
             watch.limits = (*watch.limits, change.current)
+        if could_begin and not watch.may_begin:
+            watch.forbidden_since = now()
         await self.slave(unit).change_orders(change)
-        watch.allowed = self.slave(unit).orders.allowed
         if change.current is not None:
             watch.limits = (change.current,)
 
@@ -267,6 +302,7 @@ class MixScene(MasterScene):
         self.line.live()
         total = 0.0
         for unit, watch in self.watched.items():
+            self._check_access(unit, watch)
             total += self._look(unit, watch)
         self.most = max(self.most, total)
         over = total - self.master.circuit.limit
@@ -308,14 +344,31 @@ class MixScene(MasterScene):
         if self.beside_another:
             self.excused["another master lets a box begin"] += 1
             return
-        if watch.allowed is False:
-            self._note(f"{unit} begins, and is not allowed")
+        if not watch.may_begin:
+            if now() - watch.forbidden_since > CROSSED:
+                self._note(f"{unit} begins, and is not allowed")
+            else:
+                self.excused["a pause was ordered after the grant"] += 1
         off = watch.off_since
         if off is not None and not self.box(unit).controller.outlet.access:
             if now() - off > CROSSED:
                 self._note(f"{unit} begins without access")
             else:
                 self.excused["access was turned off after the grant"] += 1
+
+    def _check_access(self, unit: int, watch: Watch) -> None:
+        """Look whether we turn access on that was turned off at the box."""
+        controller = self.box(unit).controller
+        register = self.specs[unit].row.register_of("access")
+        for write in controller.writes[watch.writes :]:
+            if (write.register, write.values) != (register, (1,)):
+                continue
+            off, watch.off_since = watch.off_since, None
+            if off is None or self.beside_another:
+                continue
+            if off > watch.on_at + STANDING:
+                self._note(f"{unit}: access was turned on, which the box had off")
+        watch.writes = len(controller.writes)
 
     def _check_limit(self, unit: int, watch: Watch) -> None:
         spec = self.specs[unit]
@@ -364,12 +417,64 @@ class MixScene(MasterScene):
     def _add_up(self, sent: Sent) -> None:
         super()._add_up(sent)
         if sent.is_broadcast:
+            if not self._is_broadcasting:
+                self._broadcasts_since = sent.when
             self._broadcast_at = sent.when
 
     def _cannot_be_reached(self, unit: int) -> bool:
         box = self.box(unit)
         lossy = box.misses(b"") or box.loses(b"")
         return box.deaf or bool(lossy) or self.damaged or not self.line.is_open
+
+    # -- The end -------------------------------------------------------------------
+
+    async def settle(self) -> bool:
+        """Wait until each order is obeyed; return whether it may be expected at all."""
+        begin = now()
+        while now() < begin + PATIENCE:
+            if self.beside_another:
+                return False
+            if self._is_broadcasting and all(
+                self.slave(unit).available for unit in self.units
+            ):
+                since = max(begin, self._broadcasts_since)
+                if now() >= since + SETTLED:
+                    return True
+            await asyncio.sleep(0.5)
+        return False
+
+    def check_orders(self) -> None:
+        """Look at boxes that must not charge by their orders."""
+        for unit, watch in self.watched.items():
+            orders = self.slave(unit).orders
+            limit = orders.limit.current or 0.0
+            if watch.closed and (not orders.allowed or limit < MINIMUM_CURRENT):
+                self._note(f"{unit} goes on, and is not allowed")
+
+    async def pause_all(self) -> None:
+        """Order a pause of each box: it confirms that, and has stopped then."""
+        for unit in self.units:
+            try:
+                async with asyncio.timeout(STANDING):
+                    await self.order(unit, OrderChange(allowed=False))
+            except (EvseError, TimeoutError) as err:
+                self._note(f"{unit} is not paused: {err!r}")
+            # In C1 it has taken the pause; its contactor opens once the car lets go.
+            if self.box(unit).offers:
+                self._note(f"{unit} goes on, and its pause was confirmed")
+
+    async def fall_silent(self) -> None:
+        """Stop the library: each box stops, by itself or stopped by us."""
+        slaves = [self.slave(unit) for unit in self.units]
+        try:
+            await asyncio.gather(*(slave.on_shutdown() for slave in slaves))
+        except EvseError as err:
+            self._note(f"one is not stopped: {err!r}")
+        await self.bus.stop()
+        await asyncio.sleep(STANDING)
+        for unit, watch in self.watched.items():
+            if watch.closed:
+                self._note(f"{unit} goes on without a master")
 
     # -- What was written ----------------------------------------------------------
 
@@ -383,6 +488,15 @@ class MixScene(MasterScene):
                 if what:
                     self._note(f"{unit}: {what} was written: {write}")
 
+    def is_pause(self, sent: Sent) -> bool:
+        """Return whether it turns off the access of one box, which was read."""
+        unit, register = sent.data[0], int.from_bytes(sent.data[2:4], "big")
+        if unit not in self.specs or self.slave(unit).dialect is None:
+            return False
+        row = self.specs[unit].row
+        is_access = register == row.register_of("access") and row.version3 is None
+        return is_access and sent.values == (0,)
+
     def _forbidden(self, unit: int, register: int, values: tuple[int, ...]) -> str:
         """Return why a register must not be written."""
         dialect = self.specs[unit].row
@@ -395,6 +509,17 @@ class MixScene(MasterScene):
         if register == dialect.register_of("state") and dialect.status_writable:
             return "" if len(values) == 2 else "more than state and error"
         return "another register"
+
+
+def silent_once_granted(box: Box, *, deaf: bool) -> None:
+    """Let nothing of a box arrive from its grant on, or to it either."""
+
+    def is_lost(data: bytes) -> bool:
+        return not data or box.controller.outlet.contactor
+
+    box.loses = is_lost
+    if deaf:
+        box.misses = is_lost
 
 
 def lossy(box: Box, share: float, dice: Random) -> None:

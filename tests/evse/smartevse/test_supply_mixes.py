@@ -24,7 +24,14 @@ from hypothesis import (
 
 from custom_components.evse_bus.evse.errors import EvseError
 from custom_components.evse_bus.evse.model import OrderChange
-from tests.evse.smartevse.mixes import FAMILIES, UNITS, BoxSpec, MixScene, lossy
+from tests.evse.smartevse.mixes import (
+    FAMILIES,
+    UNITS,
+    BoxSpec,
+    MixScene,
+    lossy,
+    silent_once_granted,
+)
 from tests.simulated_time import now, simulate
 from tests.virtual import Car
 
@@ -33,10 +40,10 @@ PHASES = tuple(set(Phase) - {Phase.explain})
 """To explain a failure would take minutes."""
 SEATS = 7
 """Most boxes of one master; a story names them by their place."""
-HEALTHY = 10.0
-"""The end of each story: all is well again, s."""
-ALL_COME, FIRST_COMES = 3, 1
-"""Seeds with which all cars are there at the beginning, or the first of two."""
+ALL_COME, FIRST_COMES, NONE_COMES = 3, 1, 0
+"""Seeds with which all cars are there at the beginning, or the first of two, or none."""
+FALLS_SILENT = 3
+"""One with which the only car is there, and the library ends."""
 SHARE, BEGINNING = 0.7, 9.0
 """Cars that are there before the story, and time for them to begin, s."""
 SLOWEST = 3.0
@@ -66,6 +73,9 @@ UNKNOWNS: dict[str, st.SearchStrategy[Any]] = {
     "access_stored": st.booleans(),
     "modem": st.sampled_from((0, 0, 2)),
     "kept": st.booleans(),
+    "allowed": st.sampled_from((True, True, True, False)),
+    "limit": st.sampled_from((32.0, 32.0, 32.0, 9.3, 5.0)),
+    "access": st.sampled_from((True, True, True, False)),
 }
 
 type Act = tuple[str, int, float]
@@ -74,8 +84,9 @@ acts = st.lists(
     st.tuples(
         st.sampled_from(
             (
-                *("come", "come", "come", "leave", "rest", "ask", "press"),
+                *("come", "come", "come", "leave", "rest", "ask", "press", "press"),
                 *("deaf", "mute", "lossy", "damaged", "reset", "well", "well"),
+                *("silent once granted", "gone once granted"),
                 *("away", "back", "again", "reload", "other", "alone"),
                 *("off", "on", "none", "less", "more", "low supply", "high supply"),
             )
@@ -92,6 +103,7 @@ silences = st.lists(
             (
                 *("come", "come", "leave", "rest", "ask", "ask"),
                 *("deaf", "no broadcasts", "no broadcasts", "well", "off", "none"),
+                *("silent once granted", "gone once granted", "press", "more"),
             )
         ),
         st.integers(0, 2),
@@ -139,6 +151,8 @@ def do_to_box(scene: MixScene, what: str, unit: int, dice: Random) -> None:
         case "no broadcasts":
             # It is read, and does not receive what it may offer.
             box.misses = lambda data: data[:1] in (b"\0", b"\x09", b"")
+        case "silent once granted" | "gone once granted":
+            silent_once_granted(box, deaf=what[0] == "g")
         case "reset":
             scene.power_cycle(unit)
         case "well":
@@ -202,8 +216,11 @@ async def live(scene: MixScene, family: str, story: list[Act], dice: Random) -> 
         scene.damaged = False
         scene.line.damage = lambda data: data
         scene.unplug_adapter(away=False)
-        await asyncio.sleep(HEALTHY)
+        is_settled = await scene.settle()
         scene.check_writes()
+        if is_settled:
+            scene.check_orders()
+            await (scene.pause_all() if dice.randrange(2) else scene.fall_silent())
 
 
 def check(
@@ -240,6 +257,27 @@ def check(
     limit=st.sampled_from((12.0, 18.0, 20.0, 25.0, 40.0)),
     story=acts,
     seed=st.integers(0, 1000),
+)
+# A pause of 2.17 is its access; a 0 in the broadcast would leave it at 6 A.
+@example(
+    mix=("2.17", [BoxSpec(dialect="2.17")]),
+    limit=20.0,
+    story=[("off", 0, 5.0)],
+    seed=ALL_COME,
+)
+# Access is turned off while it asks: after a grant it would go on all the same.
+@example(
+    mix=("2.20", [BoxSpec(dialect="2.20", reaction=3.0)]),
+    limit=20.0,
+    story=[("leave", 0, 3.0), ("come", 0, 0.15), ("press", 0, 10.0)],
+    seed=ALL_COME,
+)
+# It would charge for ever after our end.
+@example(
+    mix=("2.30", [BoxSpec(dialect="3.6", kept=True)]),
+    limit=20.0,
+    story=[("come", 0, 5.0)],
+    seed=FALLS_SILENT,
 )
 def test_any_mix_keeps_to_the_supply(
     mix: tuple[str, list[BoxSpec]], limit: float, story: list[Act], seed: int
@@ -295,6 +333,38 @@ def test_any_mix_keeps_to_the_supply(
     ],
     seed=FIRST_COMES,
 )
+# It was granted current, and no status shows that.
+@example(
+    mix=("2.17", [BoxSpec(dialect="2.17"), BoxSpec(dialect="2.17")]),
+    limit=12.0,
+    story=[("silent once granted", 1, 0.05), ("come", 1, 25.0)],
+    seed=FIRST_COMES,
+)
+@example(
+    mix=("2.30", [BoxSpec(dialect="2.30+"), BoxSpec(dialect="2.30")]),
+    limit=12.0,
+    story=[
+        *(("leave", 0, 3.0), ("gone once granted", 1, 0.05)),
+        *(("come", 1, 5.0), ("come", 0, 25.0)),
+    ],
+    seed=FIRST_COMES,
+)
+@example(
+    mix=("2.20", [BoxSpec(dialect="2.20"), BoxSpec(dialect="2.20")]),
+    limit=12.0,
+    story=[("gone once granted", 1, 0.05), ("come", 1, 25.0)],
+    seed=FIRST_COMES,
+)
+# It was granted more than the broadcast that it missed after that.
+@example(
+    mix=("2.17", [BoxSpec(dialect="2.17"), BoxSpec(dialect="2.17", limit=9.3)]),
+    limit=25.0,
+    story=[
+        *(("come", 1, 9.0), ("gone once granted", 0, 0.05)),
+        *(("come", 0, 0.6), ("more", 1, 20.0)),
+    ],
+    seed=NONE_COMES,
+)
 def test_what_a_silent_box_may_be_offering_counts(
     mix: tuple[str, list[BoxSpec]], limit: float, story: list[Act], seed: int
 ) -> None:
@@ -342,7 +412,7 @@ def test_boxes_of_two_families_are_written_nothing(
                 await asyncio.sleep(2)
             written = [s for s in scene.line.sent if s.data[1] not in (3, 4)]
             assert [s for s in written if s.when > begin] == []
-            # Neither before that.
-            assert written == []
+            # Neither before that, but for the pause of a box that was read.
+            assert [s for s in written if not scene.is_pause(s)] == []
 
     simulate(run())
