@@ -16,7 +16,10 @@ from custom_components.evse_bus.evse.model import (
 )
 from custom_components.evse_bus.evse.smartevse.dialects import Dialect
 from custom_components.evse_bus.evse.smartevse.master import LISTENING, PERIOD, SLACK
-from custom_components.evse_bus.evse.smartevse.slave import LONG_STATUS_INTERVAL
+from custom_components.evse_bus.evse.smartevse.slave import (
+    LONG_STATUS_INTERVAL,
+    MAXIMUM_INTERVAL,
+)
 from tests.evse.smartevse.scene import MasterScene, Sent
 from tests.simulated_time import now, simulate
 
@@ -548,6 +551,21 @@ def test_6_a_while_no_cable_was_measured(dialect: str) -> None:
             await asyncio.sleep(20)
             assert {sent.values[1] for sent in scene.broadcasts()} == {60}
             assert scene.slave(2).limits.ceiling == 6
+
+    simulate(scene())
+
+
+@each
+def test_a_maximum_lowered_at_the_box_counts_while_it_charges(dialect: str) -> None:
+    async def scene() -> None:
+        more = {"limit": 32.0, "current": 32.0, "maximum": 25}
+        async with scene_of(dialect, **more) as scene:
+            await charging(scene, 2)
+            assert scene.offers == 25
+            scene.box(2).controller.outlet.settings["max_current"] = 10
+            begin = now()
+            await scene.until(lambda: scene.offers == 10)
+            assert now() - begin < MAXIMUM_INTERVAL + 2 * ROUND
 
     simulate(scene())
 

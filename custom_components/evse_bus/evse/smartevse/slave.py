@@ -72,6 +72,9 @@ BROADCASTS: Final = 4
 LONG_STATUS_INTERVAL: Final = 30.0
 """Time between two readings of temperature and serial number, which are not in the
 block that a master polls, s."""
+MAXIMUM_INTERVAL: Final = 30.0
+"""Time between two readings of the settings while a box charges that does not report
+its *MAX* in its status, and does not obey it, s."""
 
 _ANSWER_BYTES: Final = LONGEST_REQUEST
 """A turn that answers may have a broadcast instead."""
@@ -402,6 +405,9 @@ class SlaveSmartEvse(SmartEvseCharger[SlaveConfig], Member):
             self._charging_since = now
         if self._is_polled:
             self._polled.on_status(status, now)
+            if charges and not MAPS[self.known_dialect].reports_maximum:
+                due = now + MAXIMUM_INTERVAL
+                self.configuration_due = min(self.configuration_due, due)
         self.master.on_status(
             self.unit,
             round(status.current * 10),
