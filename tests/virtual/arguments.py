@@ -253,7 +253,8 @@ def _smartevse(add: Callable[..., object]) -> None:
         nargs="+",
         choices=list(DIALECTS),
         default=["2.17"],
-        help="the firmware, for each box; 2.30+: the development version after 2.30;"
+        metavar="FIRMWARE",
+        help="for each box, of %(choices)s; 2.30+: the development version after 2.30;"
         " 3.00 to 3: five lines of 3.x, of which 3 is the newest",
     )
     add(

@@ -12,8 +12,6 @@ from pathlib import Path
 import re
 from typing import TYPE_CHECKING, Any, Literal
 
-import pytest
-
 from .smartevse_alone import SmartEvseAlone
 
 if TYPE_CHECKING:
@@ -94,7 +92,6 @@ FIRMWARES = [
         0x1E1E,
     ),
 ]
-every_firmware = pytest.mark.parametrize("firmware", FIRMWARES, ids=lambda f: f.trace)
 
 
 class Recorded(SmartEvseAlone):

@@ -16,6 +16,7 @@ import pytest
 
 from .ews_client import EwsClient
 from .raw_client import RawClient
+from .smartevse_frames import FRAME_GAP
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "virtual-chargers"
 READ_FULL = b":0103002E0005C9\r\n"
@@ -136,6 +137,8 @@ def test_smartevse_nodes_of_several_dialects() -> None:
     ):
         # The stored circuit limit of each.
         for request in ("0204020100016181", "0304020100016050", "080402010001612b"):
+            # Without silence after the reply before it, a request is no frame.
+            time.sleep(2 * FRAME_GAP)
             client.write(bytes.fromhex(request))
             assert client.read(7)[1:5].hex() == "04020014"
 

@@ -21,8 +21,9 @@ from .smartevse_recorded import (
     Firmware,
     Line,
     Recorded,
-    every_firmware,
 )
+
+every_firmware = pytest.mark.parametrize("firmware", FIRMWARES, ids=lambda f: f.trace)
 
 # Nodes of each time-line; and from their power-up to its beginning, s: the trace does
 # not have it, and the 60 s of a refusal run in the seconds of the box since then.

@@ -16,6 +16,7 @@ import pytest
 
 from .smartevse_frames import write_several_frame
 from .smartevse_recorded import (
+    FIRMWARES,
     NOTE,
     ROUND,
     SECOND,
@@ -23,9 +24,10 @@ from .smartevse_recorded import (
     CarState,
     Firmware,
     Recorded,
-    every_firmware,
     seen_inside,
 )
+
+every_firmware = pytest.mark.parametrize("firmware", FIRMWARES, ids=lambda f: f.trace)
 
 # Duration of an exchange, and of one without a reply, s.
 EXCHANGE, UNANSWERED = 0.05, 0.35
