@@ -21,6 +21,7 @@ from hypothesis import (
     settings,
     strategies as st,
 )
+import pytest
 
 from custom_components.evse_bus.evse.errors import EvseError
 from custom_components.evse_bus.evse.model import OrderChange
@@ -36,6 +37,7 @@ from tests.simulated_time import now, simulate
 from tests.virtual import Car
 
 EXAMPLES = int(os.environ.get("SUPPLY_EXAMPLES", "6"))
+pytestmark = pytest.mark.timeout(60 + 2 * EXAMPLES)
 PHASES = tuple(set(Phase) - {Phase.explain})
 """To explain a failure would take minutes."""
 SEATS = 7
