@@ -204,15 +204,15 @@ def asked_by_state(log: Iterable[LoggedFrame], end: float) -> list[Ask]:
                 del waiting[unit]
                 found.append(Ask(unit, ASKS[state], since, frame.start, frame.start))
             continue
-        told = int.from_bytes(frame.data[3:5], "big")
-        if told == state:
+        shown = int.from_bytes(frame.data[3:5], "big")
+        if shown == state:
             continue
         if state:
             # The car has left, or an error has ended it.
             del waiting[unit]
             found.append(Ask(unit, ASKS[state], since, None, frame.end))
-        if told in ASKS:
-            waiting[unit] = (told, frame.end)
+        if shown in ASKS:
+            waiting[unit] = (shown, frame.end)
     found.extend(
         Ask(unit, ASKS[state], since, None, end)
         for unit, (state, since) in waiting.items()

@@ -55,7 +55,7 @@ where one goes up only after the other has gone down. All times are from the vir
 bus's log and from the boxes' own records. Deviation: of a broadcast from a grid of
 exactly 2 s, read once from the library at the beginning; broadcasts between, sent
 because of a change, do not count as late or early. Answer: from the time the bus is idle
-after a box's request (2.17), or from the end of the reading that shows its wish (later
+after a box's request (2.17), or from the end of the reading that shows its request (later
 ones), to the first byte of our reply. Round: from a due broadcast until each box was
 read. Offered: the pilot of the box has the new current."""
 
@@ -152,10 +152,10 @@ def _figures(scene: MasterScene, seen: Seen) -> list[Figure]:
             note=f"of {len(asks)} ({counted}); longest {max(waited):.2f} s",
         ),
         _milliseconds(
-            f"{prefix}box's wish to its answer, p50", percentile(waited, 0.5)
+            f"{prefix}box's request to its answer, p50", percentile(waited, 0.5)
         ),
         _milliseconds(
-            f"{prefix}box's wish to its answer, p99", percentile(waited, 0.99)
+            f"{prefix}box's request to its answer, p99", percentile(waited, 0.99)
         ),
         *_answers(prefix, in_time),
         _given(prefix, seen),

@@ -64,7 +64,7 @@ class AddressSteps[
     ResultT: FlowResult[Any, Any],
     HandlerT,
 ](FlowHandler[ContextT, ResultT, HandlerT]):
-    """Steps from a wish for another address to its result."""
+    """Steps from the request for another address to its result."""
 
     def __init__(self) -> None:
         """Start without a change."""
