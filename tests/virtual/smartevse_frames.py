@@ -18,7 +18,6 @@ READ_HOLDING, READ_INPUT, WRITE_ONE, WRITE_SEVERAL = 0x03, 0x04, 0x06, 0x10
 READS = (READ_HOLDING, READ_INPUT)
 LONGEST = 50
 SHORTEST = 8
-EXCEPTION_LENGTH = 5
 # More silence than this ends a frame, s; and the silence before a reply, s.
 FRAME_GAP = 0.003
 ANSWER_SILENCE = 0.006

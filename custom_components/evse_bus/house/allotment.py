@@ -45,7 +45,6 @@ class Contender:
         self.refused = False
         """The main fuse left less than the minimum when it last wanted to charge."""
         self._report = ChargerReport(at=-inf)
-        self._takes_since: float | None = None
         self._idle_since: float | None = None
         self._shy_since: float | None = None
         if kept is not None:

@@ -77,14 +77,6 @@ def test_the_broadcast_is_that_of_the_makers_master(dialect: Dialect) -> None:
     assert all(frame.startswith(start) for frame in frames)
 
 
-@pytest.mark.parametrize("dialect", RECORDED)
-def test_all_stop_is_that_of_the_makers_master(dialect: Dialect) -> None:
-    row = MAPS[dialect].balancing
-    assert row.all_stop_register is not None
-    head = f"{row.broadcast_unit:02x}06{row.all_stop_register:04x}"
-    assert {one[:8] for one in sent(dialect) if one[2:4] == "06"} == {head}
-
-
 def test_families_and_handshakes() -> None:
     """A letter or a number as the state decides who asks; 2.20 is a family alone."""
     families = {dialect: row.balancing.family for dialect, row in MAPS.items()}

@@ -264,8 +264,6 @@ class Balancing:
     broadcast_register: int
     currents: int
     """Values of a broadcast, for units 1, 2 and so on."""
-    all_stop_register: int | None
-    """Error bits for all nodes, at the broadcast unit; ``None``: not known."""
     handshake: Handshake
     status: Registers[Status]
     """The block that its master polls; a longer one (`Map.status`) has more."""
@@ -360,7 +358,6 @@ _NODE: Final = Balancing(
     broadcast_unit=9,
     broadcast_register=0x0020,
     currents=8,
-    all_stop_register=0x0001,
     handshake=Handshake.POLLED,
     status=_status_0000(_KELVIN, _ACCESS, words=8),
     zero_stops=True,
@@ -379,7 +376,6 @@ _GENTLE_NODE: Final = replace(
 _NODE_3: Final = replace(
     _GENTLE_NODE,
     status=_status_0000(_KELVIN, _ACCESS_3, words=8),
-    all_stop_register=None,
     access_is_volatile=False,
 )
 
@@ -439,7 +435,6 @@ MAPS: Final[Mapping[Dialect, Map]] = {
             broadcast_unit=0,
             broadcast_register=0x0001,
             currents=4,
-            all_stop_register=0x0002,
             handshake=Handshake.REQUESTS,
             status=_status_a0(_LETTER_STATES),
             zero_stops=False,
@@ -463,7 +458,6 @@ MAPS: Final[Mapping[Dialect, Map]] = {
             _NODE,
             family=Family.V2_20,
             broadcast_register=0x0001,
-            all_stop_register=0x00A1,
             status=_status_a0(_NUMBER_STATES, words=11),
         ),
         socket=Word(0xC0, Flag()),
