@@ -58,6 +58,31 @@ def test_an_old_status_is_not_answered_but_read_again_at_once() -> None:
     simulate(scene())
 
 
+def test_an_answer_that_is_not_sent_is_logged(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level("DEBUG")
+    why = "Slave 2: a status that is no longer new is not answered"
+
+    async def scene() -> None:
+        async with MasterScene(units=(2,), dialect="2.30") as scene:
+            await asyncio.sleep(8)
+            slave = scene.slave(2)
+            handshake = PolledHandshake(slave)
+            for state, error in (("G", 0), ("A", 1)):
+                handshake.on_status(replace(ASKS, raw_state=state, error=error), now())
+                follow_up = handshake.after_poll(scene.master)
+                assert follow_up is not None
+                # Another one was answered before its turn.
+                handshake._take(now())
+                caplog.clear()
+                await slave.run(follow_up.conversation)
+                logged = [text for _, _, text in caplog.record_tuples]
+                assert why in logged
+
+    simulate(scene())
+
+
 @pytest.mark.parametrize(("before", "then"), [(60, GRANTED), (160, REFUSED)])
 def test_what_its_pilot_may_show_must_fit(before: int, then: bytes) -> None:
     """It was charging with 16 A a moment ago; meanwhile the other goes up to 10 A."""

@@ -6,8 +6,8 @@ written right after the status that asks for it, and never twice for one status.
 that was refused asks again 60 s after that was cleared. PROTOCOLS.md, 3.
 """
 
-from contextlib import suppress
 from functools import partial
+import logging
 from math import inf
 from typing import Final
 
@@ -21,6 +21,8 @@ from .member import Balancer, Member
 from .registers import tenths
 from .sharing import LOWEST
 from .states import faults_of
+
+_LOGGER: Final = logging.getLogger(__name__)
 
 ANSWER_WITHIN: Final = 0.6
 """Latest answer to a status, s; the recorded masters took up to 0.53 s."""
@@ -114,14 +116,15 @@ class PolledHandshake:
         rounds = ROUNDS
         self._is_answering = True
         try:
-            with suppress(EvseError):
-                while rounds and self._needs_room(master):
-                    rounds -= 1
-                    await master.lower(turn, master.above_share(slave.unit))
-                    await rest(worst_case=slave.worst_case)
-                    await slave.read_status_once(turn)
-                    await rest(worst_case=slave.worst_case)
-                await slave.write_state(turn, partial(self._answer_frame, master))
+            while rounds and self._needs_room(master):
+                rounds -= 1
+                await master.lower(turn, master.above_share(slave.unit))
+                await rest(worst_case=slave.worst_case)
+                await slave.read_status_once(turn)
+                await rest(worst_case=slave.worst_case)
+            await slave.write_state(turn, partial(self._answer_frame, master))
+        except EvseError as error:
+            self._log(error)
         finally:
             self._is_answering = False
         master.update_shares()
@@ -168,6 +171,10 @@ class PolledHandshake:
         slave.reserve(now + RESERVED_FOR)
         return grant_current(slave.unit, self._dialect, status)
 
+    def _log(self, error: EvseError) -> None:
+        """Log why nothing was sent. The box asks again: it is answered after a poll."""
+        _LOGGER.debug("Slave %s: %s", self._slave.unit, error)
+
     # -- The end of a refusal --------------------------------------------------------
 
     def _may_clear(self, status: Status, master: Balancer) -> bool:
@@ -183,8 +190,10 @@ class PolledHandshake:
 
     async def _clear(self, master: Balancer, turn: Turn) -> None:
         """Let a refused box ask again: a conversation."""
-        with suppress(EvseError):
+        try:
             await self._slave.write_state(turn, partial(self._clear_frame, master))
+        except EvseError as error:
+            self._log(error)
 
     def _clear_frame(self, master: Balancer) -> bytes:
         status = self._take(master.now)
