@@ -358,13 +358,12 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
 
     async def _stop(self, turn: Turn, *, ours: bool) -> None:
         """Turn access off; ``ours``: for lack of current, so that it is restored."""
-        had_access = self.status is None or self.status.access is not False
+        had_access = self.has_access is not False
         try:
             await self.set_access(turn, allowed=False)
         except NotConfirmedError:
             # Where access is off, the car alone is the problem (`watch_pause`).
-            taken = self.status is not None and self.status.access is False
-            self.notice(Fault.LIMIT_NOT_TAKEN, present=not taken)
+            self.notice(Fault.LIMIT_NOT_TAKEN, present=self.has_access is not False)
             raise
         self._paused_for_limit = ours and (had_access or self._paused_for_limit)
         if not ours:

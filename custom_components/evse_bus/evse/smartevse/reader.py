@@ -440,7 +440,7 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
             for pause in (0.0, READ_AGAIN):
                 await rest(pause)
                 await self.read_status(turn)
-                if self._has_access(allowed):
+                if self._has_followed(allowed):
                     self._closed_by_us = self.has_access is False
                     return
             await rest()
@@ -451,7 +451,7 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
     async def close_access(self, turn: Turn) -> None:
         """Turn access off where a setting has opened it; raises as `set_access`."""
         await self.read_status(turn)
-        if self.status is None or self.status.access is not False:
+        if self.has_access is not False:
             await rest()
             await self.set_access(turn, allowed=False)
         self.must_close_access = False
@@ -461,7 +461,7 @@ class SmartEvseReader[C: SmartEvseConfig](Charger[C]):
         """Return its access bit by the last status; ``None``: not known."""
         return None if self.status is None else self.status.access
 
-    def _has_access(self, allowed: bool) -> bool:  # noqa: FBT001
+    def _has_followed(self, allowed: bool) -> bool:  # noqa: FBT001
         """Return whether the last status confirms that access is on, or off."""
         if self.status is None:
             return False

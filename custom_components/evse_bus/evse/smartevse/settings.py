@@ -68,7 +68,7 @@ async def _set(
             # The memory wears out: no value is written twice.
             return
         # Kept until access is certain: replies may be lost, or the line.
-        reader.must_close_access |= not _has_access(reader)
+        reader.must_close_access |= reader.has_access is not True
         dialect = reader.known_dialect
         # Once, whatever the reply: the read-back shows whether it took effect.
         await reader.write(
@@ -99,13 +99,9 @@ async def _check(reader: SmartEvseReader[SmartEvseConfig], turn: Turn) -> None:
     if not await reader.read_configuration(turn):
         message = f"the settings of {name} could not be read: nothing was written"
         raise NotAvailableError(message, "smartevse_settings_not_read")
-    if reader.status is None or reader.status.access is None:
+    if reader.has_access is None:
         message = f"the access of {name} has no known value: nothing was written"
         raise NotAvailableError(message, "smartevse_access_not_known")
-
-
-def _has_access(reader: SmartEvseReader[SmartEvseConfig]) -> bool:
-    return reader.status is not None and reader.status.access is True
 
 
 def _stands(
