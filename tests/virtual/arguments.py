@@ -53,7 +53,7 @@ def parser() -> argparse.ArgumentParser:
     for name, about, own in (
         ("abl", "ABL EVCC2/3 boxes", _abl),
         ("evbox", "EVBox ChargePoints (Protocol Max v4)", _evbox),
-        ("smartevse", "SmartEVSE v2 boxes", _smartevse),
+        ("smartevse", "SmartEVSE boxes", _smartevse),
         ("ews", "P-CHARGE EWS-Boxes (MCS binary)", ews_cli.add_arguments),
     ):
         kind = kinds.add_parser(

@@ -29,8 +29,8 @@ class SmartEvse(Device):
     """A SmartEVSE; `controller` handles its frames, `outlet` has its states.
 
     - `dialect`: a key of `DIALECTS`, or one of your own; `load_balance`: 0 off, 1
-      master, else a slave and its unit; `unit`: its address with load balancing off, if not the
-      default of the dialect
+      master, else a slave and its unit; `unit`: its address with load balancing off, if
+      not the default of the dialect
     - `config`: "socket" (with a `cable` of 13, 16, 32 or 63 A) or "fixed"
     - `override_works`: False: a 2.17 before the override: refused, no effect
     - `settings`: further stored settings by name, see `smartevse_registers`

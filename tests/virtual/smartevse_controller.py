@@ -1,4 +1,4 @@
-"""The frames of a virtual SmartEVSE v2: registers, refusals, silence.
+"""The frames of a virtual SmartEVSE: registers, refusals, silence.
 
 Frames in, frames out, and the devices' time: no wire and no thread, so that it also
 works in simulated time.

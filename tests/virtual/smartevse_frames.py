@@ -1,4 +1,4 @@
-"""Modbus RTU as a SmartEVSE v2 implements it: pure functions.
+"""Modbus RTU as a SmartEVSE implements it: pure functions.
 
 A box finds the end of a frame by silence alone, and the kind of a frame by its length.
 A write of one register is a request or a reply: that depends on the frame before.

@@ -1,4 +1,4 @@
-"""The clock of a virtual SmartEVSE v2: seconds, errors, its own cycle. No wire."""
+"""The clock of a virtual SmartEVSE: seconds, errors, its own cycle. No wire."""
 
 from __future__ import annotations
 

@@ -87,12 +87,13 @@ class Dialect:
     `unit_when_disabled`: its address without load balancing; `gentle`: it stops the car
     by the pilot (C1, B1) before it opens the contactor; `external_master`: requests of
     another master stop its own cycle; `reports_cable`: its maximum is that of the cable
-    alone (traces, `normal`); `measures`: it searches for the smallest current of each car first, and
-    ignores the override meanwhile (trace of HEAD, `first_minutes`); `balance_register`: for the charge currents that
-    a master broadcasts; `polled`: the registers that it reads at its nodes; `silent`: write-only registers without a reply;
-    `version3`: 3.x, which differs in much more; `mains_words`: currents of the mains
-    that the broadcast of a master has behind those of the nodes; `longest`: frame that
-    it receives, in bytes.
+    alone (traces, `normal`); `measures`: it searches for the smallest current of each
+    car first, and ignores the override meanwhile (trace of HEAD, `first_minutes`);
+    `balance_register`: for the charge currents that a master broadcasts; `polled`: the
+    registers that it reads at its nodes; `silent`: write-only registers without a
+    reply; `version3`: 3.x, which differs in much more; `mains_words`: currents of the
+    mains that the broadcast of a master has behind those of the nodes; `longest`: frame
+    that it receives, in bytes.
     """
 
     name: str

@@ -1,6 +1,7 @@
-"""The states of a virtual SmartEVSE v2, and their changes by the pilot. No clock.
+"""The states of a virtual SmartEVSE, and their changes by the pilot. No clock.
 
-Written from the manual, the recorded trace, and the facts in the README.
+Written from the manual, the recorded traces, and the facts in the README; what 3.x
+does otherwise is in `smartevse_outlet3`.
 """
 
 from __future__ import annotations

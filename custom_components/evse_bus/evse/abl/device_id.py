@@ -457,7 +457,8 @@ class DeviceIdChange:
     def _begin(self, stage: _Stage) -> None:
         """Enter a stage; note how the charger leaves E2 if that ends too early."""
         self.stage = stage
-        # A box left in E2 lets no car charge: behind a slow adapter the way out takes long.
+        # A box left in E2 lets no car charge; behind a slow adapter the way out takes
+        # long.
         self._bus.stop_patience = UNFINISHED_PATIENCE
         if self._own is None:
             return

@@ -303,7 +303,7 @@ class EvboxCharger(Charger[EvboxConfig]):
     @property
     @override
     def may_be_paused(self) -> bool:
-        # Its pause is in our set-point alone: nobody else can pause it.
+        # Its pause is in our set-point alone: nothing at the box can pause it.
         return False
 
     @property

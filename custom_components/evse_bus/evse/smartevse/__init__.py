@@ -1,4 +1,4 @@
-"""SmartEVSE v2: Modbus RTU on RS-485, polled or with us as load-balancing master."""
+"""SmartEVSE: Modbus RTU on RS-485, polled or with us as load-balancing master."""
 
 from collections.abc import Mapping
 from dataclasses import replace

@@ -494,7 +494,8 @@ MAPS: Final[Mapping[Dialect, Map]] = {
         begins_at_0=True,
         shows_plug=True,
     ),
-    # Before 3.7.4 it does not stop without a master in mode normal; which one it is cannot be read.
+    # Before 3.7.4 it does not stop without a master in mode normal; which version it is
+    # cannot be read.
     Dialect.V3_OLD: replace(_VERSION_3, balancing=replace(_NODE_3, stops_after=inf)),
     Dialect.V3: _VERSION_3,
 }

@@ -230,7 +230,7 @@ class PolledSmartEvse(SmartEvseCharger[PolledConfig]):
         super().on_line_open()
         self._written = None
         if self._serial is None:
-            # Another box may be in its place, whose access somebody else has turned off.
+            # Another box may be in its place, whose access a driver has turned off.
             self._paused_for_limit = False
 
     @override

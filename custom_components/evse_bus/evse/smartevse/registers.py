@@ -1,4 +1,4 @@
-"""Requests to a SmartEVSE v2 in any of its dialects, and their replies.
+"""Requests to a SmartEVSE in any of its dialects, and their replies.
 
 Pure functions. The tables are in `dialects`, load balancing is in `balancing`.
 """
@@ -51,7 +51,8 @@ def decode_status(
 ) -> Status:
     """Return the contents of a status block of this dialect.
 
-    ``registers``: the block, if not that of `Map.status`. Raises ImplausibleReplyError for contents that no SmartEVSE of this dialect has.
+    ``registers``: the block, if not that of `Map.status`. Raises ImplausibleReplyError
+    for contents that no SmartEVSE of this dialect has.
     """
     try:
         return (registers or MAPS[dialect].status).decode(data)
