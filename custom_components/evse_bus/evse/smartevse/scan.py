@@ -95,19 +95,20 @@ async def scan_slaves(
     del config, orders
     found: dict[int, FoundCharger] = {}
     garbled: set[int] = set()
+    silent: set[int] = set()
     strangers: set[int] = set()
     progress(0.0)
     plan = [unit for units in ROUNDS for unit in units]
     for index, unit in enumerate(plan):
         if unit in found or unit in strangers:
             continue
-        garbled.discard(unit)
         try:
             found[unit] = await _identify_slave(bus, unit)
         except GarbledReplyError:
-            # In each round: two boxes. In one, it was noise.
             garbled.add(unit)
-        except ReplyTimeoutError, LineBusyError:
+        except ReplyTimeoutError:
+            silent.add(unit)
+        except LineBusyError:
             pass
         except ImplausibleReplyError, ExchangeRefusedError:
             # Another Modbus device has this address.
@@ -118,12 +119,14 @@ async def scan_slaves(
             return ScanResult(other_master=True)
         progress((index + 1) / len(plan))
     progress(1.0)
-    if len(garbled) == len(SLAVES):
+    # Two boxes disturb each other in every round; in some of them, it was noise.
+    doubled = garbled - silent - strangers - found.keys()
+    if len(doubled) == len(SLAVES):
         # Boxes do not collide at all addresses: the line settings do not fit.
         return ScanResult(unreadable=True)
     return ScanResult(
         found=tuple(found[unit] for unit in sorted(found)),
-        duplicates=tuple(sorted(garbled)),
+        duplicates=tuple(sorted(doubled)),
     )
 
 
