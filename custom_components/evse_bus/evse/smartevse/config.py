@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from ..model import ChargerConfig, Fact
-from .dialects import SLAVES, UNITS, Dialect
+from .dialects import SLAVES, Dialect
 
 
 def kept_dialect(text: str) -> Dialect | None:
@@ -15,10 +15,7 @@ def kept_dialect(text: str) -> Dialect | None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SmartEvseConfig(ChargerConfig):
-    """A SmartEVSE; in most cases its load-balancing setting is its address.
-
-    Raises ValueError for an address that no box has.
-    """
+    """A SmartEVSE; in most cases its load-balancing setting is its address."""
 
     facts: ClassVar[Mapping[str, Fact]] = {
         **ChargerConfig.facts,
@@ -31,12 +28,6 @@ class SmartEvseConfig(ChargerConfig):
     """The one that was found last. It is what to expect until the box was probed, as
     it is after each connect; ``None``: it never was."""
 
-    def __post_init__(self) -> None:
-        """Check the address."""
-        if self.address not in UNITS:
-            message = f"{self.address} is no address of a SmartEVSE (0 to 8)"
-            raise ValueError(message)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PolledConfig(SmartEvseConfig):
@@ -48,7 +39,7 @@ class PolledConfig(SmartEvseConfig):
     """Turn its access off on shutdown: it has no fail-safe of its own."""
 
     def __post_init__(self) -> None:
-        """Check the address: slaves stop when no master broadcasts."""
+        """Raise ValueError for another address: slaves stop without broadcasts."""
         if self.address not in (0, 1):
             message = f"{self.address} is the address of a slave; polled are 0 and 1"
             raise ValueError(message)
